@@ -1,0 +1,35 @@
+"""Camera localisation that anyone can train for their own place.
+
+>>> import mambaloc
+>>> mambaloc.list_models()
+['mambaloc']
+>>> system = mambaloc.create_model("mambaloc", gis="gis")  # a LightningModule; .network is a plain nn.Module
+"""
+
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mambaloc.data import PoseDataModule
+    from mambaloc.models import create_model, list_models, load
+    from mambaloc.models.mambaloc import LitMambaLoc
+
+__version__ = version("mambaloc")
+
+# Imported on first use: `import mambaloc` alone costs nothing and needs no torch.
+_EXPORTS = {
+    "LitMambaLoc": "mambaloc.models.mambaloc",
+    "PoseDataModule": "mambaloc.data",
+    "create_model": "mambaloc.models",
+    "list_models": "mambaloc.models",
+    "load": "mambaloc.models",
+}
+
+__all__ = ["LitMambaLoc", "PoseDataModule", "__version__", "create_model", "list_models", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        return getattr(import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module 'mambaloc' has no attribute {name!r}")

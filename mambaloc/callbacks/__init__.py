@@ -1,0 +1,9 @@
+"""What happens around training."""
+
+from mambaloc.callbacks.early_stopping import EarlyStopping
+from mambaloc.callbacks.onnx_export import OnnxExport
+from mambaloc.callbacks.progress import PoseProgressBar
+from mambaloc.callbacks.trajectory_plot import TrajectoryPlot
+from mambaloc.callbacks.wall_clock import WallClock
+
+__all__ = ["EarlyStopping", "OnnxExport", "PoseProgressBar", "TrajectoryPlot", "WallClock"]

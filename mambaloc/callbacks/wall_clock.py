@@ -1,0 +1,77 @@
+"""Training seconds, apart from set-up and validation."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import lightning as L
+import torch
+
+from mambaloc.errors import InputError
+
+
+class WallClock(L.Callback):
+    """Clock set-up, training and validation apart, and how long training took to reach a given error.
+
+    Training seconds leave out set-up, validation, checkpoints and export. The clock survives a resume: a
+    checkpoint holds it. On an accelerator it waits for the device before each reading.
+
+    Args:
+        reach: validation medians, such as ``{"position_error_m": 0.2, "rotation_error_deg": 10}``; the training
+            seconds after which all were first reached are recorded.
+    """
+
+    def __init__(self, reach: dict[str, float] | None = None) -> None:
+        self.reach = reach or {}
+        self.seconds = {"setup_s": 0.0, "train_s": 0.0, "validation_s": 0.0}
+        self.reached_s: float | None = None
+        self._last = time.perf_counter()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the readings so far."""
+        return {**self.seconds, "reached_s": self.reached_s, "reach": dict(self.reach)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a checkpoint's readings, adding this process's own set-up."""
+        self.seconds = {name: state_dict[name] for name in self.seconds}
+        self.reached_s = state_dict["reached_s"]
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """End set-up."""
+        self._lap(pl_module, "setup_s")
+
+    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Begin an epoch; what lay between epochs is nobody's."""
+        self._lap(pl_module, None)
+
+    def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Pause training."""
+        if not trainer.sanity_checking:
+            self._lap(pl_module, "train_s")
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Go on with training, and see whether the error sought is reached."""
+        if trainer.sanity_checking:
+            return
+        self._lap(pl_module, "validation_s")
+        if self.reach and self.reached_s is None:
+            metrics = trainer.callback_metrics
+            for name in self.reach:
+                if f"val/{name}" not in metrics:
+                    raise InputError(f"wall_clock.reach: no validation metric {name!r}; try position_error_m")
+            if all(metrics[f"val/{name}"] <= sought for name, sought in self.reach.items()):
+                self.reached_s = self.seconds["train_s"]
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """End an epoch."""
+        self._lap(pl_module, "train_s")
+        pl_module.log("time/train_s", self.seconds["train_s"], rank_zero_only=True)
+
+    def _lap(self, pl_module: L.LightningModule, name: str | None) -> None:
+        if pl_module.device.type == "cuda":
+            torch.cuda.synchronize(pl_module.device)
+        now = time.perf_counter()
+        if name is not None:
+            self.seconds[name] += now - self._last
+        self._last = now

@@ -1,0 +1,25 @@
+"""Scenes on disk to batches of posed images."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mambaloc.data.datamodule import PoseDataModule
+    from mambaloc.data.datasets import DATASETS
+    from mambaloc.data.frames import BadFrames, Frames
+
+# Imported on first use: downloading or rendering a scene needs no torch.
+_EXPORTS = {
+    "BadFrames": "mambaloc.data.frames",
+    "DATASETS": "mambaloc.data.datasets",
+    "Frames": "mambaloc.data.frames",
+    "PoseDataModule": "mambaloc.data.datamodule",
+}
+
+__all__ = ["DATASETS", "BadFrames", "Frames", "PoseDataModule"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        return getattr(import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module 'mambaloc.data' has no attribute {name!r}")

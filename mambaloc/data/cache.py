@@ -1,0 +1,155 @@
+"""Decode every image once: frames resized to a short side, kept as one uint8 memory map.
+
+A cache is keyed by what it was made from (each image's name, size, first and last 4 KiB) and how (settings), so moving
+a scene keeps it and changing an image or a setting makes a new one. It is built under a lock in a folder of its own and
+renamed into place when complete: a killed run leaves nothing that is ever read, and two processes build it once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from filelock import FileLock
+from numpy.typing import NDArray
+from rich.progress import track
+
+from mambaloc.data.frames import BadFrames
+from mambaloc.errors import InputError
+
+_VERSION = 1
+_EDGE_BYTES = 4096
+_MARKERS = {b"\x89PNG": b"IEND", b"\xff\xd8\xff": b"\xff\xd9"}  # how a format starts, and how a whole file ends
+
+
+@dataclass(frozen=True)
+class FrameCache:
+    """Decoded frames of a list of images.
+
+    Shape:
+        ``images`` (K, 3, H, W) uint8 RGB, read-only and memory-mapped; ``rows`` (K,), which image of the list each is:
+        K is smaller than the list where bad images were left out.
+    """
+
+    images: NDArray[np.uint8]
+    rows: NDArray[np.int64]
+
+
+def default_cache_dir() -> Path:
+    """``$MAMBALOC_CACHE``, or ``mambaloc`` in the user's cache folder."""
+    if "MAMBALOC_CACHE" in os.environ:
+        return Path(os.environ["MAMBALOC_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mambaloc"
+
+
+def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_dir: Path | None = None) -> FrameCache:
+    """Open the cache of some images, building it first where there is none.
+
+    Args:
+        paths: the images, in order.
+        short_side: height or width, whichever is smaller, in pixels, that images are resized to.
+        bad: what to do with an image that is missing, truncated, or of another shape than the first.
+        cache_dir: where caches are kept.
+
+    Raises:
+        InputError: for a bad image where ``bad`` says so, no good image at all, or a full disk.
+    """
+    root = (cache_dir or default_cache_dir()) / "frames"
+    folder = root / _key(paths, short_side)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.with_suffix(".lock")):
+            if not folder.is_dir():
+                _build(folder, paths, short_side)
+    except OSError as error:
+        raise InputError(f"{root}: the frame cache cannot be written ({error}); set MAMBALOC_CACHE elsewhere") from None
+    meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+    for row, rule in meta["bad"]:
+        bad.reject(paths[row], rule)
+    if not meta["rows"]:
+        raise InputError(f"{paths[0].parent}: none of {len(paths)} images can be used")
+    return FrameCache(np.load(folder / "images.npy", mmap_mode="r"), np.array(meta["rows"], dtype=np.int64))
+
+
+def _key(paths: Sequence[Path], short_side: int) -> str:
+    digest = hashlib.sha256(f"{_VERSION} {short_side}".encode())
+    with ThreadPoolExecutor() as pool:
+        for path, content in zip(paths, pool.map(_fingerprint, paths), strict=True):
+            digest.update(f"{path.parent.name}/{path.name}\0".encode())
+            digest.update(content)
+    return digest.hexdigest()[:32]
+
+
+def _fingerprint(path: Path) -> bytes:
+    """Size, first and last bytes: a PNG's end holds its checksum, so any change of its pixels shows there."""
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            head = file.read(_EDGE_BYTES)
+            file.seek(max(0, size - _EDGE_BYTES))
+            return hashlib.sha256(f"{size}\0".encode() + head + file.read()).digest()
+    except OSError:
+        return b"missing"
+
+
+def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:
+    partial = folder.with_suffix(".partial")  # only this process has it: the lock is held
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    images: NDArray[np.uint8] | None = None
+    rows: list[int] = []
+    bad: list[tuple[int, str]] = []
+    with ThreadPoolExecutor() as pool:
+        decoded = pool.map(lambda path: _decode(path, short_side), paths)
+        for row, frame in enumerate(_with_progress(decoded, len(paths))):
+            if isinstance(frame, str):
+                bad.append((row, frame))
+                continue
+            if images is None:
+                images = np.lib.format.open_memmap(
+                    partial / "images.npy", mode="w+", dtype=np.uint8, shape=(len(paths), *frame.shape)
+                )
+            if frame.shape != images.shape[1:]:
+                bad.append((row, f"image is {_size(frame)} after resizing, where the first is {_size(images[0])}"))
+                continue
+            images[len(rows)] = frame
+            rows.append(row)
+    if images is not None:
+        images.flush()
+    (partial / "meta.json").write_text(json.dumps({"rows": rows, "bad": bad, "short_side": short_side}))
+    partial.replace(folder)
+
+
+def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:
+    """Return an image as (3, H, W) RGB at the short side, or the rule it breaks."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return "image cannot be read"
+    for start, end in _MARKERS.items():
+        # OpenCV fills what a truncated file lacks with grey and says nothing.
+        if data.startswith(start) and end not in data[-_EDGE_BYTES:]:
+            return "image is truncated"
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        return "image cannot be decoded"
+    scale = short_side / min(image.shape[:2])
+    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+    resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    return np.ascontiguousarray(resized[..., ::-1].transpose(2, 0, 1))
+
+
+def _size(frame: NDArray[np.uint8]) -> str:
+    return f"{frame.shape[-1]}x{frame.shape[-2]}"
+
+
+def _with_progress(frames: Iterable[NDArray[np.uint8] | str], total: int) -> Iterable[NDArray[np.uint8] | str]:
+    return track(frames, "Decoding frames, once", total=total, transient=True)

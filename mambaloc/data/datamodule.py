@@ -1,0 +1,225 @@
+"""From a scene's folder to augmented batches on the device."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning as L
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
+
+from mambaloc.data.augmentation import Jitter, augment, center_crop, draw_augmentations
+from mambaloc.data.cache import cached_frames
+from mambaloc.data.datasets import DATASETS, is_official, scene_folder
+from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
+from mambaloc.data.splits import Validation, hold_out, subsample
+from mambaloc.errors import InputError
+from mambaloc.types import PoseBatch
+
+Part = Literal["train", "val", "test"]
+
+
+class CachedFrames(Dataset[PoseBatch]):
+    """Frames of one part of a scene, already decoded; fetched a batch at a time."""
+
+    def __init__(self, frames: Frames, images: NDArray[np.uint8]) -> None:
+        self.frames, self.images = frames, images
+        self.position_m = torch.from_numpy(frames.position_m).float()
+        self.quaternion = torch.from_numpy(frames.quaternion).float()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitems__(self, indices: list[int]) -> PoseBatch:
+        """Fetch a batch: ``image`` (B, 3, H, W) uint8 as cached, uncropped."""
+        index = torch.tensor(indices)
+        images = torch.from_numpy(np.stack([self.images[i] for i in indices]))
+        return PoseBatch(images, self.position_m[index], self.quaternion[index], index)
+
+
+@dataclass(frozen=True)
+class LoadedSplit:
+    """One part of a scene with what was left out of it."""
+
+    data: CachedFrames
+    bad: BadFrames
+
+
+class PoseDataModule(L.LightningDataModule):
+    """A scene's training, validation and test frames.
+
+    Args:
+        dataset: ``7scenes``, ``cambridge``, or ``embedded``: the generated room.
+        root: folder that holds the scenes; the dataset's own default unless given.
+        scene: folder of the scene under ``root``.
+        image_size: side of the square crop, or (height, width), in pixels.
+        short_side: what the shorter side of every image is resized to, in pixels.
+        batch_size: training images a step, per device.
+        eval_batch_size: images a step of validation and test.
+        num_workers: loader processes; frames come from a memory map, so none is often fastest.
+        brightness: range of that jitter factor, ``[1 - x, 1 + x]``.
+        contrast: likewise.
+        saturation: likewise.
+        validation: how the best epoch is chosen; ``test_set`` selects on the test set and is reported as such.
+        val_fraction: share of the training frames that is held out.
+        val_gap: frames dropped between a held-out block and training frames.
+        val_sequences: sequences to hold out, by name.
+        keep_every: train on every k-th frame of each sequence (sparsity 1/k).
+        keep_count: train on so many frames, uniform in time, instead.
+        on_bad_frame: ``error`` stops at a bad frame; ``skip`` leaves it out and counts it.
+        cache_dir: where decoded frames are kept; ``$MAMBALOC_CACHE`` or the user's cache folder unless given.
+    """
+
+    def __init__(
+        self,
+        dataset: str = "7scenes",
+        root: str | None = None,
+        scene: str = "heads",
+        image_size: int | tuple[int, int] = 224,
+        short_side: int = 256,
+        batch_size: int = 8,
+        eval_batch_size: int = 32,
+        num_workers: int = 0,
+        brightness: float = 0.3,
+        contrast: float = 0.3,
+        saturation: float = 0.3,
+        validation: Validation = "auto",
+        val_fraction: float = 0.1,
+        val_gap: int = 20,
+        val_sequences: list[str] | None = None,
+        keep_every: int = 1,
+        keep_count: int | None = None,
+        on_bad_frame: OnBadFrame = "error",
+        cache_dir: str | None = None,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        self.crop = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+        if max(self.crop) > short_side and min(self.crop) > short_side:
+            raise InputError(f"data.image_size {image_size}: larger than data.short_side {short_side}; enlarge that")
+        self.jitter = Jitter(brightness, contrast, saturation)
+        self._loaded: dict[Part, LoadedSplit] = {}
+        self._listed: dict[str, int] = {}
+
+    @property
+    def folder(self) -> Path:
+        """The scene's folder."""
+        root = self.hparams["root"]
+        return scene_folder(self.hparams["dataset"], Path(root) if root else None, self.hparams["scene"])
+
+    def setup(self, stage: str) -> None:
+        """Read and decode what a stage needs; every process may, since the cache is built by one of them."""
+        if stage in ("fit", "validate") and "train" not in self._loaded:
+            self._load_train_and_val()
+        needs_test = stage in ("test", "predict") or self.hparams["validation"] == "test_set"
+        if needs_test and "test" not in self._loaded:
+            frames, bad = self._read("test")
+            self._loaded["test"] = self._decode(frames, bad)
+        if self.hparams["validation"] == "test_set" and "val" not in self._loaded:
+            self._loaded["val"] = self._loaded["test"]
+
+    @property
+    def train_position_m(self) -> Tensor:
+        """Positions of the training frames, (N, 3)."""
+        return self._loaded["train"].data.position_m
+
+    def frames(self, part: Part) -> Frames:
+        """Return the frames of a part, in the order of ``PoseBatch.index``."""
+        return self._loaded[part].data.frames
+
+    def describe(self) -> dict[str, Any]:
+        """Say which frames a number comes from: scene, counts, selection rule, what was left out and repaired."""
+        hparams = self.hparams
+        return {
+            "dataset": hparams["dataset"],
+            "scene": self.folder.name,
+            "official_split": is_official(hparams["dataset"], hparams["scene"], self._listed),
+            "listed_frames": dict(self._listed),
+            **{f"{part}_frames": len(loaded.data) for part, loaded in self._loaded.items()},
+            "skipped": {part: loaded.bad.counts() for part, loaded in self._loaded.items()},
+            "repaired": {part: len(loaded.bad.repaired) for part, loaded in self._loaded.items()},
+            "validation": hparams["validation"],
+            "keep_every": hparams["keep_every"],
+            "keep_count": hparams["keep_count"],
+            "image_size": list(self.crop),
+            "short_side": hparams["short_side"],
+        }
+
+    def train_dataloader(self) -> DataLoader[PoseBatch]:
+        """Shuffled training batches."""
+        return self._loader("train", self.hparams["batch_size"], shuffle=True)
+
+    def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
+        """Validation batches in order; none under ``validation: none``."""
+        return self._loader("val", self.hparams["eval_batch_size"]) if "val" in self._loaded else []
+
+    def test_dataloader(self) -> DataLoader[PoseBatch]:
+        """Test batches in order."""
+        return self._loader("test", self.hparams["eval_batch_size"])
+
+    def predict_dataloader(self) -> DataLoader[PoseBatch]:
+        """Test batches in order, for predictions without errors."""
+        return self.test_dataloader()
+
+    def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
+        """Crop and normalise on the device; jitter while training."""
+        if self.trainer is None or not self.trainer.training:
+            return replace(batch, image=center_crop(batch.image, self.crop))
+        seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
+        how = draw_augmentations(batch.image, self.crop, self.jitter, seed, self.trainer.current_epoch, batch.index)
+        return replace(batch, image=augment(batch.image, how, self.crop))
+
+    def _read(self, split: Split) -> tuple[Frames, BadFrames]:
+        bad = BadFrames(self.hparams["on_bad_frame"])
+        frames = DATASETS[self.hparams["dataset"]].read_split(self.folder, split, bad)
+        self._listed[split] = len(frames) + len(bad.rejected)
+        return frames, bad
+
+    def _decode(self, frames: Frames, bad: BadFrames) -> LoadedSplit:
+        cache_dir = self.hparams["cache_dir"]
+        cache = cached_frames(
+            frames.image_paths, self.hparams["short_side"], bad, Path(cache_dir) if cache_dir else None
+        )
+        return LoadedSplit(CachedFrames(frames.select(cache.rows), cache.images), bad)
+
+    def _load_train_and_val(self) -> None:
+        frames, bad = self._read("train")
+        train, validation = frames, self.hparams["validation"]
+        if validation not in ("none", "test_set"):
+            options = {name: self.hparams[f"val_{name}"] for name in ("fraction", "gap", "sequences")}
+            train_rows, val_rows = hold_out(frames, validation, **options)
+            train = frames.select(train_rows)
+            self._loaded["val"] = self._decode(frames.select(val_rows), BadFrames(bad.policy))
+        kept = subsample(train, self.hparams["keep_every"], self.hparams["keep_count"])
+        self._loaded["train"] = self._decode(train.select(kept), bad)
+
+    def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
+        data, trainer = self._loaded[part].data, self.trainer
+        # One sampler everywhere: Lightning gives it the epoch, so order depends on (seed, epoch) alone.
+        sampler = DistributedSampler(
+            data,
+            num_replicas=trainer.world_size if trainer else 1,
+            rank=trainer.global_rank if trainer else 0,
+            shuffle=shuffle,
+            seed=int(os.environ.get("PL_GLOBAL_SEED", "0")),
+        )
+        return DataLoader(
+            data,
+            batch_size,
+            sampler=sampler,
+            num_workers=self.hparams["num_workers"],
+            collate_fn=_as_fetched,
+            pin_memory=torch.cuda.is_available(),
+            persistent_workers=self.hparams["num_workers"] > 0,
+        )
+
+
+def _as_fetched(batch: PoseBatch) -> PoseBatch:
+    """Keep a batch that came whole from ``__getitems__``; a named function, since workers pickle it."""
+    return batch

@@ -1,0 +1,87 @@
+"""Posed frames of a split, and what is done with a bad one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+
+Split = Literal["train", "test"]
+OnBadFrame = Literal["error", "skip"]
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A frame, or a part of one, that breaks a rule."""
+
+    path: Path
+    rule: str
+
+
+@dataclass
+class BadFrames:
+    """Decide what a bad frame does: stop the run, or be left out and counted.
+
+    Args:
+        policy: ``error`` raises at the first bad frame; ``skip`` records it.
+    """
+
+    policy: OnBadFrame = "error"
+    rejected: list[Rejection] = field(default_factory=list)
+    repaired: list[Rejection] = field(default_factory=list)
+
+    def reject(self, path: Path, rule: str) -> None:
+        """Leave a frame out.
+
+        Raises:
+            InputError: under the policy ``error``.
+        """
+        if self.policy == "error":
+            raise InputError(f"{path}: {rule}; mend or remove it, or leave it out with on_bad_frame: skip")
+        self.rejected.append(Rejection(path, rule))
+
+    def repair(self, path: Path, rule: str) -> None:
+        """Record a frame that was mended and kept."""
+        self.repaired.append(Rejection(path, rule))
+
+    def counts(self) -> dict[str, int]:
+        """How many frames broke each rule."""
+        return dict(Counter(rejection.rule for rejection in self.rejected))
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Posed images in the order they were taken, sequence after sequence.
+
+    Shape:
+        ``image_paths`` and ``sequences`` hold N entries; ``position_m`` is (N, 3), ``quaternion`` (N, 4),
+        canonical wxyz: ``world_from_cam``, float64.
+    """
+
+    image_paths: tuple[Path, ...]
+    sequences: tuple[str, ...]
+    position_m: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.image_paths)
+
+    def select(self, indices: NDArray[np.int64]) -> Frames:
+        """Return the frames at some indices, in that order."""
+        return Frames(
+            tuple(self.image_paths[i] for i in indices),
+            tuple(self.sequences[i] for i in indices),
+            self.position_m[indices],
+            self.quaternion[indices],
+        )
+
+    def by_sequence(self) -> dict[str, NDArray[np.int64]]:
+        """Indices of each sequence's frames, in order of first appearance."""
+        names = np.array(self.sequences)
+        return {name: np.flatnonzero(names == name) for name in dict.fromkeys(self.sequences)}

@@ -1,0 +1,105 @@
+"""Hold out a validation set honestly, and thin a training set.
+
+Neighbouring frames are about 1 cm and 0.5 degrees apart, so a random split would leak.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.data.frames import Frames
+from mambaloc.errors import InputError
+
+Validation = Literal["auto", "sequences", "block", "none", "test_set"]
+"""How the best epoch is chosen. ``auto`` holds out sequences where there are several, else a block;
+``test_set`` selects on the test set, as several published codes do, and is written into every result."""
+
+
+def hold_out(
+    frames: Frames,
+    validation: Literal["auto", "sequences", "block"] = "auto",
+    fraction: float = 0.1,
+    gap: int = 20,
+    sequences: list[str] | None = None,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Split training frames into those to train on and those to validate on.
+
+    Args:
+        frames: the training split.
+        validation: by whole sequences, or by a block.
+        fraction: share of frames to hold out: sequences from the last on until it is reached, or the end of each
+            sequence.
+        gap: frames dropped between a block and what is trained on.
+        sequences: the sequences to hold out, by name, instead of a fraction.
+
+    Returns:
+        Indices to train on and to validate on, (T,) and (V,).
+
+    Raises:
+        InputError: where one of the two would be empty, or a sequence is not there.
+    """
+    by_sequence = frames.by_sequence()
+    if sequences or validation == "sequences" or (validation == "auto" and len(by_sequence) > 1):
+        held_out = sequences or _last_sequences(by_sequence, round(fraction * len(frames)))
+        return _by_sequences(by_sequence, held_out)
+    blocks = [_block(indices, fraction, gap) for indices in by_sequence.values()]
+    train, val = (np.concatenate(part) for part in zip(*blocks, strict=True))
+    if not len(train) or not len(val):
+        raise InputError(
+            f"data.val_fraction {fraction} and val_gap {gap} leave {len(train)} frames to train and {len(val)} to "
+            f"validate on, of {len(frames)}; change them, or use data.validation: none"
+        )
+    return train, val
+
+
+def _last_sequences(by_sequence: dict[str, NDArray[np.int64]], wanted: int) -> list[str]:
+    held_out: list[str] = []
+    for name in reversed(list(by_sequence)):
+        held_out.append(name)
+        if sum(len(by_sequence[n]) for n in held_out) >= wanted:
+            break
+    return held_out
+
+
+def _by_sequences(
+    by_sequence: dict[str, NDArray[np.int64]], held_out: list[str]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    unknown = [name for name in held_out if name not in by_sequence]
+    if unknown:
+        raise InputError(f"data.val_sequences: no {unknown[0]} in the training split; it has {', '.join(by_sequence)}")
+    train = [indices for name, indices in by_sequence.items() if name not in held_out]
+    if not train:
+        raise InputError("data.validation: holding out these sequences leaves none to train on; use validation: block")
+    return np.concatenate(train), np.concatenate([by_sequence[name] for name in by_sequence if name in held_out])
+
+
+def _block(indices: NDArray[np.int64], fraction: float, gap: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Cut the end of a sequence off, and a gap before it."""
+    start = len(indices) - max(1, round(fraction * len(indices)))
+    return indices[: max(0, start - gap)], indices[start:]
+
+
+def subsample(frames: Frames, keep_every: int = 1, keep_count: int | None = None) -> NDArray[np.int64]:
+    """Choose training frames uniformly in time.
+
+    Args:
+        frames: the training frames.
+        keep_every: every k-th frame of each sequence: the paper's sparsity 1/k.
+        keep_count: instead, so many frames in all, spread evenly over the sequences laid end to end.
+
+    Returns:
+        Indices, (K,).
+
+    Raises:
+        InputError: where a number is out of range.
+    """
+    if keep_count is not None:
+        if not 1 <= keep_count <= len(frames):
+            raise InputError(f"data.keep_count {keep_count}: there are {len(frames)} training frames")
+        return (np.arange(keep_count) * len(frames)) // keep_count
+    if keep_every < 1:
+        raise InputError(f"data.keep_every {keep_every}: must be 1 or more")
+    return np.concatenate([indices[::keep_every] for indices in frames.by_sequence().values()])

@@ -1,0 +1,149 @@
+"""Run a checkpoint over a split and write what it measured, with provenance."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+
+from mambaloc import provenance
+from mambaloc.data import PoseDataModule
+from mambaloc.errors import InputError
+from mambaloc.evaluation.trajectories import write_csv, write_tum
+from mambaloc.metrics import PoseErrorTable, summarise
+from mambaloc.models import LitPoseRegressor, load
+from mambaloc.models.base import parameter_mib, read_checkpoint
+from mambaloc.viz import draw_trajectory
+
+
+def evaluate_checkpoint(
+    checkpoint: Path, out: Path, data: PoseDataModule | None = None, accelerator: str = "auto"
+) -> dict[str, Any]:
+    """Localise every test frame with a checkpoint and write the result to a folder.
+
+    Writes ``metrics.json``, ``predictions.csv``, ``predictions.tum``, ``ground_truth.tum`` and ``trajectory.png``.
+
+    Args:
+        checkpoint: what a training run wrote.
+        out: the folder to write to.
+        data: the frames; those of the training recipe unless given.
+        accelerator: as Lightning's Trainer takes it.
+
+    Returns:
+        What ``metrics.json`` holds.
+
+    Raises:
+        InputError: for a bad checkpoint, missing or bad data, or a folder that cannot be written.
+    """
+    stored = read_checkpoint(checkpoint)
+    system = load(checkpoint)
+    data = data or data_of(stored, checkpoint)
+    check_image_size(system, data, checkpoint)
+    trainer = L.Trainer(
+        accelerator=accelerator,
+        devices=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        enable_progress_bar=False,
+        barebones=False,
+    )
+    started = time.perf_counter()
+    trainer.test(system, datamodule=data, verbose=False)
+    seconds = time.perf_counter() - started
+    table = system.test_errors.table()
+    result = {
+        "metrics": summarise(table),
+        "count": len(table.index),
+        "data": data.describe(),
+        "split": "test",
+        "selection": selection_rule(stored, checkpoint),
+        "model": _describe_model(system),
+        "training": _describe_training(stored, checkpoint),
+        "evaluation": {
+            "commit": provenance.commit(),
+            "versions": provenance.versions(),
+            "device": provenance.device_name(system.device.index if system.device.type == "cuda" else None),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "seconds": round(seconds, 3),
+        },
+    }
+    _write(out, result, table, data)
+    return result
+
+
+def data_of(stored: dict[str, Any], checkpoint: Path) -> PoseDataModule:
+    """Rebuild the data module that a checkpoint was trained with."""
+    hparams = {k: v for k, v in stored.get("datamodule_hyper_parameters", {}).items() if not k.startswith("_")}
+    if not hparams:
+        raise InputError(f"{checkpoint}: holds no data settings; train it with tools/train.py")
+    return PoseDataModule(**hparams)
+
+
+def check_image_size(system: LitPoseRegressor, data: PoseDataModule, checkpoint: Path) -> None:
+    """Refuse data whose crops the network was not built for."""
+    if data.crop != system.image_size:
+        raise InputError(f"data.image_size {data.crop}: {checkpoint} was trained on {system.image_size}; use that")
+
+
+def selection_rule(stored: dict[str, Any], checkpoint: Path) -> str:
+    """Say in words how this epoch was chosen."""
+    if checkpoint.stem == "last":
+        return "last epoch"
+    monitor = next((s["monitor"] for n, s in stored["callbacks"].items() if n.startswith("ModelCheckpoint")), None)
+    if monitor is None:
+        return "last epoch"
+    where = "SELECTED ON THE TEST SET" if _validates_on_test(stored) else "on frames held out of the training split"
+    return f"epoch of lowest {monitor}, {where}"
+
+
+def _validates_on_test(stored: dict[str, Any]) -> bool:
+    return stored.get("datamodule_hyper_parameters", {}).get("validation") == "test_set"
+
+
+def _describe_model(system: LitPoseRegressor) -> dict[str, Any]:
+    return {
+        "name": system.registry_name,
+        "parameters": sum(p.numel() for p in system.network.parameters()),
+        "mib": round(parameter_mib(system.network), 3),
+        "hyperparameters": dict(system.hparams),
+    }
+
+
+def _describe_training(stored: dict[str, Any], checkpoint: Path) -> dict[str, Any]:
+    recipe = checkpoint.parent.parent / "config.yaml"
+    clock = next((state for name, state in stored["callbacks"].items() if name.startswith("WallClock")), None)
+    return {
+        **stored["mambaloc"],
+        "epoch": stored["epoch"] + 1,
+        "step": stored["global_step"],
+        "wall_clock": clock,
+        "recipe": str(recipe) if recipe.is_file() else None,
+        "recipe_sha256": _sha256(recipe) if recipe.is_file() else None,
+        "checkpoint": str(checkpoint),
+        "checkpoint_sha256": _sha256(checkpoint),
+    }
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, data: PoseDataModule) -> None:
+    frames = data.frames("test")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "metrics.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        write_csv(out / "predictions.csv", table, frames)
+        write_tum(out / "predictions.tum", table.index, table.predicted_position_m, table.predicted_quaternion)
+        write_tum(out / "ground_truth.tum", table.index, table.true_position_m, table.true_quaternion)
+        title = f"{result['model']['name']} on {result['data']['scene']} (test), {result['selection'].split(',')[0]}"
+        draw_trajectory(table, frames.sequences, out / "trajectory.png", title)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another folder with --out") from None

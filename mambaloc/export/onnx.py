@@ -1,0 +1,142 @@
+"""ONNX export, checked against PyTorch before the file is given its name."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import json
+import logging
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnxruntime
+import torch
+from torch import Tensor, nn
+from torch.export import Dim
+
+from mambaloc.errors import InputError
+from mambaloc.geometry import canonical, rotation_error_deg
+from mambaloc.models import LitPoseRegressor
+
+OPSET = 18
+_CHECKED_BATCHES = (1, 3)
+
+
+@dataclass(frozen=True)
+class Parity:
+    """Largest difference between ONNX Runtime and PyTorch."""
+
+    position_m: float
+    rotation_deg: float
+
+
+class DeployedNetwork(nn.Module):
+    """The network as an app sees it: plain tensors out, the quaternion canonical.
+
+    Shape:
+        (B, 3, H, W) in 0..1 -> (B, 3) in metres and (B, 4) unit wxyz with ``w >= 0``.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Localise images."""
+        prediction = self.network(image)
+        return prediction.position_m, canonical(prediction.quaternion)
+
+
+def export_onnx(
+    system: LitPoseRegressor, path: Path, tolerance_m: float = 1e-3, tolerance_deg: float = 0.05
+) -> Parity:
+    """Write a system's network as ONNX, with any batch size, and check it in ONNX Runtime.
+
+    Args:
+        system: trained; left as it was.
+        path: the file; it appears only once it is complete and has passed.
+        tolerance_m: largest position difference allowed, in metres per metre of the scene's size (at least one).
+        tolerance_deg: largest rotation difference allowed.
+
+    Raises:
+        InputError: where ONNX Runtime disagrees with PyTorch, or the file cannot be written.
+    """
+    deployed = DeployedNetwork(copy.deepcopy(system.network).cpu().float()).eval()
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write(deployed, system, partial)
+        parity = check_parity(deployed, partial, system.image_size)
+        size_m = max(1.0, _largest_position_m(deployed))
+        if not (parity.position_m <= tolerance_m * size_m and parity.rotation_deg <= tolerance_deg):
+            raise InputError(
+                f"{path}: ONNX Runtime differs from PyTorch by {parity.position_m:.2g} m and "
+                f"{parity.rotation_deg:.2g} deg, so it was not written; report the model and the versions"
+            )
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    return parity
+
+
+def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], seed: int = 0) -> Parity:
+    """Compare a file with the network it came from, on random images in several batch sizes."""
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    generator = torch.Generator().manual_seed(seed)
+    position_m, rotation_deg = 0.0, 0.0
+    for batch in _CHECKED_BATCHES:
+        image = torch.rand(batch, 3, *image_size, generator=generator)
+        with torch.inference_mode():
+            expected_m, expected_q = deployed(image)
+        actual_m, actual_q = (torch.from_numpy(a) for a in session.run(None, {"image": image.numpy()}))
+        position_m = max(position_m, (actual_m - expected_m).norm(dim=-1).max().item())
+        rotation_deg = max(rotation_deg, rotation_error_deg(actual_q, expected_q).max().item())
+    return Parity(position_m, rotation_deg)
+
+
+def _write(deployed: nn.Module, system: LitPoseRegressor, path: Path) -> None:
+    image = torch.zeros(2, 3, *system.image_size)
+    with _quiet():
+        program = torch.onnx.export(
+            deployed,
+            (image,),
+            input_names=["image"],
+            output_names=["position_m", "quaternion_wxyz"],
+            dynamo=True,
+            dynamic_shapes={"image": {0: Dim("batch")}},
+            opset_version=OPSET,
+            verbose=False,
+        )
+    assert program is not None
+    program.model.metadata_props["mambaloc"] = json.dumps(
+        {
+            "model": system.registry_name,
+            "input": {"image": {"shape": ["batch", 3, *system.image_size], "range": [0, 1], "colour": "RGB"}},
+            "pose": "world_from_cam, metres, quaternion wxyz with w >= 0, OpenCV camera axes",
+            "trained": system.provenance,
+        }
+    )
+    program.save(str(path), external_data=False)
+
+
+@contextlib.contextmanager
+def _quiet():  # type: ignore[no-untyped-def]
+    """The exporter reports its steps on stdout and warns of its own internals."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _largest_position_m(deployed: nn.Module) -> float:
+    scales = [m.scale_m.item() + m.mean_m.norm().item() for m in deployed.modules() if hasattr(m, "scale_m")]
+    return max(scales, default=1.0)

@@ -1,0 +1,76 @@
+"""Rigid transforms: free functions over ``Pose``, batched and differentiable.
+
+Convention
+    Names read ``a_from_c = a_from_b @ b_from_c``: inner names cancel. Leading dimensions broadcast, so N points under
+    each of B poses are points (B, N, 3) and a pose of (B, 1, 3) and (B, 1, 4). Quaternions need not be exactly
+    unit; those returned are canonical.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mambaloc.geometry.rotations import (
+    canonical,
+    conjugate,
+    matrix_from_quaternion,
+    multiply,
+    quaternion_from_matrix,
+    rotate,
+)
+from mambaloc.types import Pose
+
+
+def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
+    """Chain two transforms into ``a_from_c``."""
+    return Pose(
+        position_m=transform(a_from_b, b_from_c.position_m),
+        quaternion=canonical(multiply(a_from_b.quaternion, b_from_c.quaternion)),
+    )
+
+
+def inverse(a_from_b: Pose) -> Pose:
+    """Turn ``a_from_b`` into ``b_from_a``."""
+    b_from_a = canonical(conjugate(a_from_b.quaternion))
+    return Pose(position_m=-rotate(b_from_a, a_from_b.position_m), quaternion=b_from_a)
+
+
+def transform(a_from_b: Pose, points_b: Tensor) -> Tensor:
+    """Carry points from frame b to frame a: ``p_a = R p_b + t``.
+
+    Shape:
+        points (..., 3) -> (..., 3), metres.
+    """
+    return rotate(a_from_b.quaternion, points_b) + a_from_b.position_m
+
+
+def matrix_from_pose(pose: Pose) -> Tensor:
+    """Write a transform as the homogeneous matrix ``[R t; 0 1]``.
+
+    Shape:
+        -> (..., 4, 4).
+    """
+    top = torch.cat([matrix_from_quaternion(pose.quaternion), pose.position_m[..., None]], dim=-1)
+    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def pose_from_matrix(matrix: Tensor) -> Pose:
+    """Read a transform from its homogeneous matrix; the last row is not looked at.
+
+    Shape:
+        (..., 4, 4), or (..., 3, 4) -> a pose of (..., 3) and (..., 4).
+
+    The upper left 3x3 must be a rotation: ask ``is_rotation`` of matrices that come from a file.
+    """
+    return Pose(position_m=matrix[..., :3, 3], quaternion=quaternion_from_matrix(matrix[..., :3, :3]))
+
+
+def position_error_m(a: Tensor, b: Tensor) -> Tensor:
+    """Euclidean distance between positions, with zero gradient where they coincide.
+
+    Shape:
+        (..., 3), (..., 3) -> (...), metres.
+    """
+    return torch.linalg.vector_norm(a - b, dim=-1)

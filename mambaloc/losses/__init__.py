@@ -1,0 +1,29 @@
+"""Pose losses, chosen by name so that every hyperparameter stays plain."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import nn
+
+from mambaloc.errors import InputError
+from mambaloc.losses.weighted import FixedWeights, LearnedWeights
+
+LOSSES: dict[str, type[nn.Module]] = {"learned_weights": LearnedWeights, "fixed_weights": FixedWeights}
+
+
+def build_loss(name: str, args: dict[str, Any] | None = None) -> nn.Module:
+    """Build the loss of a name with its arguments.
+
+    Raises:
+        InputError: for an unknown name or an argument that the loss does not take.
+    """
+    if name not in LOSSES:
+        raise InputError(f"loss {name!r}: there is none; choose one of {', '.join(LOSSES)}")
+    try:
+        return LOSSES[name](**(args or {}))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"loss_args {args}: {name} does not take them ({error})") from None
+
+
+__all__ = ["LOSSES", "FixedWeights", "LearnedWeights", "build_loss"]

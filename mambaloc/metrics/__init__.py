@@ -1,0 +1,5 @@
+"""Pose errors over a whole split."""
+
+from mambaloc.metrics.pose_errors import RECALL_THRESHOLDS, PoseErrors, PoseErrorTable, summarise
+
+__all__ = ["RECALL_THRESHOLDS", "PoseErrorTable", "PoseErrors", "summarise"]

@@ -1,0 +1,206 @@
+"""What every system shares: training, validation, testing, optimiser, checkpoints."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import os
+import pickle
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import lightning as L
+import torch
+from torch import Tensor, nn
+
+from mambaloc import provenance
+from mambaloc.errors import InputError
+from mambaloc.losses import build_loss
+from mambaloc.metrics import PoseErrors
+from mambaloc.nn.heads import PositionScale
+from mambaloc.types import PoseBatch, PosePrediction
+
+
+class LitPoseRegressor(L.LightningModule):
+    """Base of every system: a network that maps images to poses, and how it is trained.
+
+    A subclass builds its network in :meth:`configure_network` and registers itself with
+    :func:`~mambaloc.models.registry.register_model`. Every hyperparameter is plain (str, number, bool, None, list,
+    dict), so that a checkpoint loads without unpickling code.
+
+    Args:
+        image_size: side of the square crop, or (height, width), in pixels; recipes set it once, in ``data``.
+        loss: name in ``mambaloc.losses.LOSSES``.
+        loss_args: that loss's arguments.
+        lr: learning rate of Adam.
+        weight_decay: L2 penalty, never on loss weights nor on a state-space mixer's A and D.
+        lr_step_epochs: epochs between cuts of the learning rate: 100 indoors, 200 outdoors in the paper.
+        lr_gamma: what a cut multiplies the learning rate by.
+        normalise_position: regress positions relative to the training positions' mean and spread.
+    """
+
+    registry_name: ClassVar[str]
+    network: nn.Module
+
+    def __init__(
+        self,
+        image_size: int | tuple[int, int] = 224,
+        loss: str = "learned_weights",
+        loss_args: dict[str, Any] | None = None,
+        lr: float = 1e-4,
+        weight_decay: float = 1e-4,
+        lr_step_epochs: int = 100,
+        lr_gamma: float = 0.1,
+        normalise_position: bool = False,
+    ) -> None:
+        super().__init__()
+        self.image_size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+        self.loss = build_loss(loss, loss_args)
+        self.lr, self.weight_decay, self.lr_step_epochs, self.lr_gamma = lr, weight_decay, lr_step_epochs, lr_gamma
+        self.normalise_position = normalise_position
+        self.val_errors, self.test_errors = PoseErrors(), PoseErrors()
+        self.provenance: dict[str, Any] = {}
+        self.save_hyperparameters()
+        self.network = self.configure_network()
+
+    def configure_network(self) -> nn.Module:
+        """Build the network from the hyperparameters: images in, :class:`~mambaloc.types.PosePrediction` out."""
+        raise TypeError(f"{type(self).__name__} defines no configure_network()")
+
+    def hyperparameters_of(self, network: type[nn.Module]) -> dict[str, Any]:
+        """Those of this system's hyperparameters that a network class takes, but for the image size."""
+        taken = set(inspect.signature(network).parameters) - {"image_size"}
+        return {name: value for name, value in self.hparams.items() if name in taken}
+
+    def forward(self, image: Tensor) -> PosePrediction:
+        """Localise images, (B, 3, H, W) in 0..1."""
+        return self.network(image)
+
+    def setup(self, stage: str) -> None:
+        """Take the scene's position statistics before the first epoch."""
+        if stage == "fit" and self.normalise_position:
+            for module in self.network.modules():
+                if isinstance(module, PositionScale):
+                    module.fit(self.trainer.datamodule.train_position_m)  # type: ignore[attr-defined]
+
+    def on_train_epoch_start(self) -> None:
+        """Tie dropout to (seed, epoch, rank), so that a resumed run continues exactly."""
+        seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
+        torch.manual_seed((seed * 1_000_003 + self.current_epoch) * 1_009 + self.global_rank)
+
+    def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
+        """Return the loss of a batch."""
+        loss = self.loss(self(batch.image), batch)
+        self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch.index), sync_dist=True)
+        return loss
+
+    def on_train_epoch_end(self) -> None:
+        """Log the learned loss weights and the learning rate."""
+        for name, parameter in self.loss.named_parameters():
+            self.log(f"train/{name}", parameter.detach())
+        self.log("train/lr", self.optimizers().param_groups[0]["lr"])  # type: ignore[union-attr]
+
+    def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:
+        """Collect a validation batch."""
+        prediction = self(batch.image)
+        self.val_errors.update(prediction, batch)
+        self.log("val/loss", self.loss(prediction, batch), batch_size=len(batch.index), sync_dist=True)
+
+    def test_step(self, batch: PoseBatch, batch_idx: int) -> None:
+        """Collect a test batch."""
+        self.test_errors.update(self(batch.image), batch)
+
+    def predict_step(self, batch: PoseBatch, batch_idx: int) -> PosePrediction:
+        """Localise a batch without looking at its true poses."""
+        return self(batch.image)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the medians and recalls over the whole validation set."""
+        self._log_errors("val", self.val_errors)
+
+    def on_test_epoch_end(self) -> None:
+        """Log the medians and recalls over the whole test set."""
+        self._log_errors("test", self.test_errors)
+
+    def _log_errors(self, split: str, errors: PoseErrors) -> None:
+        for name, value in errors.compute().items():
+            self.log(f"{split}/{name}", value, rank_zero_only=False)
+
+    def on_validation_epoch_start(self) -> None:
+        """Forget the previous validation."""
+        self.val_errors.reset()
+
+    def on_test_epoch_start(self) -> None:
+        """Forget the previous test."""
+        self.test_errors.reset()
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Adam and a stepwise learning rate, as the paper prints them."""
+        undecayed = {
+            id(getattr(module, name))
+            for module in self.modules()
+            if hasattr(module, "no_weight_decay")
+            for name in module.no_weight_decay()
+        }
+        trainable = [p for p in self.parameters() if p.requires_grad]
+        groups = [
+            {"params": [p for p in trainable if id(p) not in undecayed], "weight_decay": self.weight_decay},
+            {"params": [p for p in trainable if id(p) in undecayed], "weight_decay": 0.0},
+        ]
+        optimizer = torch.optim.Adam([g for g in groups if g["params"]], lr=self.lr, betas=(0.9, 0.999), eps=1e-10)
+        scheduler = torch.optim.lr_scheduler.StepLR(optimizer, self.lr_step_epochs, self.lr_gamma)
+        return {"optimizer": optimizer, "lr_scheduler": scheduler}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Write which system this is and where it was trained."""
+        checkpoint["mambaloc"] = {
+            "model": self.registry_name,
+            "commit": provenance.commit(),
+            "versions": provenance.versions(),
+            "device": provenance.device_name(self.device.index if self.device.type == "cuda" else None),
+            "seed": int(os.environ.get("PL_GLOBAL_SEED", "0")),
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Remember where the checkpoint came from."""
+        self.provenance = checkpoint.get("mambaloc", {})
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]
+        cls, checkpoint_path: str | Path, map_location: Any = None, **kwargs: Any
+    ) -> Self:
+        """Load a trained system; weights only, never by unpickling code.
+
+        Backbone weights are in the checkpoint, so whatever started the training is not looked for again.
+
+        Raises:
+            InputError: where the file is missing, is no such checkpoint or holds anything but plain data.
+        """
+        read_checkpoint(checkpoint_path)  # refuse with a clear line first
+        kwargs = {"backbone_weights": None, **kwargs, "weights_only": True}
+        return super().load_from_checkpoint(checkpoint_path, map_location=map_location, **kwargs)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint's plain data onto the CPU.
+
+    Raises:
+        InputError: where the file is missing, unreadable, or holds anything but tensors and plain data.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such checkpoint; a training run writes them to RUN/checkpoints/")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        reason = next((line for line in str(error).splitlines() if "GLOBAL" in line), "not plain tensors").strip()
+        raise InputError(f"{path}: refused, since loading it could run code ({reason}); use a trusted export") from None
+    except (OSError, RuntimeError, EOFError, ValueError) as error:
+        raise InputError(f"{path}: not a readable checkpoint ({type(error).__name__}); is it complete?") from None
+    if not isinstance(checkpoint, dict) or "mambaloc" not in checkpoint:
+        raise InputError(f"{path}: not a MambaLoc checkpoint; give one that a training run wrote")
+    return checkpoint
+
+
+def parameter_mib(network: nn.Module) -> float:
+    """Size of the trainable parameters as float32, in MiB: what the paper prints as "Mb"."""
+    return math.fsum(p.numel() for p in network.parameters() if p.requires_grad) * 4 / 2**20

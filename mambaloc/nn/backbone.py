@@ -1,0 +1,109 @@
+"""Convolutional backbones from timm, cut after the last feature map that is used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import timm
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from mambaloc.errors import InputError
+
+
+class Backbone(nn.Module):
+    """Feature maps of a timm model at given strides; stages past the last one do not exist.
+
+    Args:
+        name: any timm model with feature maps at ``strides``.
+        strides: what each returned map's pixels span in the image.
+        weights: ``timm`` downloads timm's own; otherwise a ``.safetensors`` file; None starts from scratch.
+        timm_args: passed on to ``timm.create_model``, for instance ``{"pad_type": "same"}``.
+        pixel_mean: RGB mean in 0..1; the timm model's own unless given.
+        pixel_std: RGB deviation in 0..1; the timm model's own unless given.
+
+    Shape:
+        image (B, 3, H, W) in 0..1 -> one (B, channels[i], ~H / strides[i], ~W / strides[i]) a stride.
+
+    Raises:
+        InputError: for an unknown model, strides that it does not have, or weights that do not fit.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        strides: tuple[int, ...] = (8, 16),
+        weights: str | None = None,
+        timm_args: dict[str, Any] | None = None,
+        pixel_mean: tuple[float, float, float] | None = None,
+        pixel_std: tuple[float, float, float] | None = None,
+    ) -> None:
+        super().__init__()
+        self.name, self.strides = name, strides
+        stages = _stages_at(name, strides)
+        try:
+            self.body = timm.create_model(
+                name,
+                pretrained=weights == "timm",
+                features_only=True,
+                feature_cls="getter",
+                out_indices=stages,
+                **(timm_args or {}),
+            )
+        except TypeError as error:
+            raise InputError(f"backbone_args {timm_args}: {name} does not take them ({error})") from None
+        except (OSError, RuntimeError) as error:
+            raise InputError(
+                f"backbone_weights: timm's weights of {name} could not be fetched ({type(error).__name__}); "
+                "name a local .safetensors file instead, or null to start from scratch"
+            ) from error
+        if weights not in (None, "timm"):
+            self._load(Path(weights))
+        self.channels: list[int] = self.body.feature_info.channels()
+        config = self.body.model.pretrained_cfg
+        self.register_buffer("pixel_mean", torch.tensor(pixel_mean or config["mean"]).view(3, 1, 1))
+        self.register_buffer("pixel_std", torch.tensor(pixel_std or config["std"]).view(3, 1, 1))
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Normalise the image and return its feature maps, finest first."""
+        return self.body((image - self.pixel_mean) / self.pixel_std)
+
+    @torch.no_grad()
+    def grids(self, image_size: tuple[int, int]) -> list[tuple[int, int]]:
+        """Rows and columns of each feature map for an image of ``(height, width)``, found by running one."""
+        training = self.training
+        shapes = [tuple(feats.shape[-2:]) for feats in self.eval()(torch.zeros(1, 3, *image_size))]
+        self.train(training)
+        return shapes
+
+    def _load(self, path: Path) -> None:
+        if path.suffix != ".safetensors":
+            raise InputError(f"backbone_weights {path}: only .safetensors files are read; convert it, or use 'timm'")
+        try:
+            missing, _ = self.body.model.load_state_dict(load_file(path), strict=False)
+        except FileNotFoundError:
+            raise InputError(f"backbone_weights {path}: no such file; name one, 'timm', or null") from None
+        except (SafetensorError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"backbone_weights {path}: does not fit {self.name} ({reason})") from None
+        if missing:
+            raise InputError(f"backbone_weights {path}: lacks {len(missing)} tensors of {self.name}, as {missing[0]}")
+
+
+def _stages_at(name: str, strides: tuple[int, ...]) -> list[int]:
+    """Index the deepest stage of a timm model at each stride."""
+    if not timm.is_model(name):
+        near = ", ".join(timm.list_models(f"*{name.split('_')[0]}*")[:5]) or "see timm.list_models()"
+        raise InputError(f"backbone {name!r}: timm has no such model; near ones: {near}")
+    try:
+        with torch.device("meta"):
+            reductions = timm.create_model(name, features_only=True, feature_cls="getter").feature_info.reduction()
+    except (RuntimeError, AttributeError, NotImplementedError) as error:
+        raise InputError(f"backbone {name!r}: timm offers no feature maps of it ({error})") from None
+    lacking = [stride for stride in strides if stride not in reductions]
+    if lacking:
+        raise InputError(f"backbone {name!r}: needs feature maps at strides {strides}, has {sorted(set(reductions))}")
+    return [max(i for i, reduction in enumerate(reductions) if reduction == stride) for stride in strides]

@@ -1,0 +1,133 @@
+"""Transformer encoder over a feature map, read out at one learned token (TransPoseNet, Shavit et al. 2024)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class LearnedPositions(nn.Module):
+    """Learned row and column encodings of a grid, with a row and a column of their own for the token.
+
+    Args:
+        grid: rows and columns of the feature map.
+        dim: token width; each half encodes one axis.
+
+    Shape:
+        () -> (1 + rows * columns, dim), the token first.
+    """
+
+    def __init__(self, grid: tuple[int, int], dim: int) -> None:
+        super().__init__()
+        if dim % 2:
+            raise ValueError(f"dim must be even to hold a row and a column half, not {dim}")
+        self.row = nn.Parameter(torch.rand(grid[0] + 1, dim // 2))  # uniform, as in DETR's learned encoding
+        self.column = nn.Parameter(torch.rand(grid[1] + 1, dim // 2))
+
+    def forward(self) -> Tensor:
+        """Lay the tables out over the tokens."""
+        rows, columns = self.row.shape[0] - 1, self.column.shape[0] - 1
+        cells_HWC = torch.cat(
+            (
+                self.column[1:].unsqueeze(0).expand(rows, -1, -1),
+                self.row[1:].unsqueeze(1).expand(-1, columns, -1),
+            ),
+            dim=-1,
+        )
+        token_1C = torch.cat((self.column[:1], self.row[:1]), dim=-1)
+        return torch.cat((token_1C, cells_HWC.flatten(0, 1)))
+
+
+class EncoderLayer(nn.Module):
+    """Pre-norm encoder layer whose queries and keys, not values, carry the position encoding (as in DETR).
+
+    Args:
+        dim: token width.
+        heads: attention heads.
+        feedforward: hidden width of the two-layer MLP with GELU.
+        dropout: after attention, inside and after the MLP.
+        attention_dropout: on attention weights. It forces the slow attention kernel, on a CPU three times the
+            cost of the whole training step, so it is off unless asked for.
+
+    Shape:
+        tokens (B, N, D), positions (N, D) -> (B, N, D).
+    """
+
+    def __init__(self, dim: int, heads: int, feedforward: int, dropout: float, attention_dropout: float) -> None:
+        super().__init__()
+        if dim % heads:
+            raise ValueError(f"width {dim} is not a multiple of {heads} heads")
+        self.heads, self.attention_dropout = heads, attention_dropout
+        self.norm_attention = nn.LayerNorm(dim)
+        self.qk = nn.Linear(dim, 2 * dim)
+        self.v = nn.Linear(dim, dim)
+        self.out = nn.Linear(dim, dim)
+        self.norm_mlp = nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(
+            nn.Linear(dim, feedforward), nn.GELU(), nn.Dropout(dropout), nn.Linear(feedforward, dim)
+        )
+        self.dropout = nn.Dropout(dropout)
+        for linear in (self.qk, self.v, self.out, self.mlp[0], self.mlp[3]):
+            nn.init.xavier_uniform_(linear.weight)
+
+    def forward(self, tokens_BND: Tensor, positions_ND: Tensor) -> Tensor:
+        """Attend, then transform each token; both around a residual."""
+        tokens_BND = tokens_BND + self.dropout(self._attend(self.norm_attention(tokens_BND), positions_ND))
+        return tokens_BND + self.dropout(self.mlp(self.norm_mlp(tokens_BND)))
+
+    def _attend(self, tokens_BND: Tensor, positions_ND: Tensor) -> Tensor:
+        query_BND, key_BND = self.qk(tokens_BND + positions_ND).chunk(2, dim=-1)
+        q, k, v = (
+            t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (query_BND, key_BND, self.v(tokens_BND))
+        )
+        dropout = self.attention_dropout if self.training else 0.0
+        attended = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout)
+        return self.out(attended.transpose(1, 2).flatten(2))
+
+
+class TokenEncoder(nn.Module):
+    """Summarise a feature map in one learned token: 1x1 convolution, positions, encoder layers, final norm.
+
+    Args:
+        in_channels: depth of the feature map.
+        grid: its rows and columns, which fix the size of the position tables.
+        dim: token width.
+        layers: encoder layers.
+        heads: attention heads.
+        feedforward: hidden width of each layer's MLP.
+        dropout: residual and MLP dropout.
+        attention_dropout: see :class:`EncoderLayer`.
+
+    Shape:
+        (B, C, rows, columns) -> (B, dim).
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        grid: tuple[int, int],
+        dim: int = 256,
+        layers: int = 6,
+        heads: int = 8,
+        feedforward: int = 256,
+        dropout: float = 0.1,
+        attention_dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.project = nn.Conv2d(in_channels, dim, 1)
+        self.token = nn.Parameter(torch.zeros(1, 1, dim))
+        self.positions = LearnedPositions(grid, dim)
+        self.layers = nn.ModuleList(
+            EncoderLayer(dim, heads, feedforward, dropout, attention_dropout) for _ in range(layers)
+        )
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, feats_BCHW: Tensor) -> Tensor:
+        """Return the token's final state."""
+        cells_BND = self.project(feats_BCHW).flatten(2).mT
+        tokens_BND = torch.cat((self.token.expand(cells_BND.shape[0], -1, -1), cells_BND), dim=1)
+        positions_ND = self.positions()
+        for layer in self.layers:
+            tokens_BND = layer(tokens_BND, positions_ND)
+        return self.norm(tokens_BND[:, 0])

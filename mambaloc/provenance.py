@@ -1,0 +1,50 @@
+"""Where a number comes from: commit, versions, device."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+MEASURED_WITH = ("mambaloc", "torch", "lightning", "timm", "numpy", "opencv-python-headless", "onnxruntime")
+
+
+def commit() -> str | None:
+    """Return this checkout's commit, ``+changes`` appended where tracked files differ; None outside a checkout."""
+    git = ["git", "-C", str(Path(__file__).parent)]
+    try:
+        # `describe --dirty` would also do, but a tag must not stand in for the hash.
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+        changes = subprocess.run([*git, "diff", "--quiet", "HEAD"], capture_output=True, check=False).returncode
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return f"{head}+changes" if changes else head
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages a number depends on."""
+    found = {"python": platform.python_version()}
+    for package in MEASURED_WITH:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found
+
+
+def device_name(cuda_index: int | None = None) -> str:
+    """Name the processor, or the CUDA device of an index."""
+    import torch  # only here: provenance is read by tools that run without it
+
+    if cuda_index is not None:
+        return torch.cuda.get_device_name(cuda_index)
+    return f"{_processor()}, {torch.get_num_threads()} threads"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

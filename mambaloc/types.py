@@ -1,0 +1,74 @@
+"""Frames, units and the records that cross every border: the one page on conventions.
+
+Convention
+    A pose is ``world_from_cam``: it takes a point in camera coordinates to world coordinates,
+    ``p_world = R @ p_cam + t``, so its translation is the camera centre in the world.
+
+    =============  ==========================================================================
+    position       metres, in the scene's world frame: names end in ``_m``
+    rotation       unit quaternion, scalar first (**wxyz**), canonical sign ``w >= 0``
+    camera axes    OpenCV: x right, y down, z forward
+    composition    ``a_from_c = a_from_b @ b_from_c``: inner names cancel
+    angles         degrees where a person reads them (``_deg``), radians in formulas (``_rad``)
+    images         RGB; ``uint8`` 0..255 in storage, ``float32`` 0..1 as network input,
+                   which normalises by its backbone's own mean and deviation
+    pixels         ``(x, y)``, the centre of the top-left pixel at ``(0, 0)`` (OpenCV)
+    =============  ==========================================================================
+
+    Every reader converts to this at its border; nothing inside the package knows another convention.
+
+Shape suffixes
+    ``B`` batch, ``N`` tokens or points, ``C`` channels, ``H W`` rows and columns, ``L`` sequence length,
+    ``D`` feature width, ``E`` inner width and ``S`` state size of a state-space mixer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Rigid transform ``a_from_b``; as a camera pose, ``world_from_cam``.
+
+    Shape:
+        ``position_m`` is (..., 3) in metres, ``quaternion`` is (..., 4), unit, wxyz.
+    """
+
+    position_m: Tensor
+    quaternion: Tensor
+
+
+@dataclass  # not frozen: Lightning fills a copy when it moves a batch to a device
+class PoseBatch:
+    """Images with their true poses, as the data module hands them to a system.
+
+    Shape:
+        ``image`` (B, 3, H, W): ``uint8`` as loaded, ``float32`` in 0..1 once on the device and augmented.
+        ``position_m`` (B, 3) and ``quaternion`` (B, 4): the true ``world_from_cam``.
+        ``index`` (B,): the frame's row in its split, which names it in every report.
+    """
+
+    image: Tensor
+    position_m: Tensor
+    quaternion: Tensor
+    index: Tensor
+
+    def pin_memory(self) -> PoseBatch:
+        """Copy to page-locked memory; the DataLoader calls it where ``pin_memory=True``."""
+        return PoseBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class PosePrediction:
+    """What a localiser says of a batch of images.
+
+    Shape:
+        ``position_m`` (B, 3) in metres. ``quaternion`` (B, 4) as the network regressed it: the loss and the
+        metrics normalise it, ``mambaloc.geometry.canonical`` makes it a unit quaternion with ``w >= 0``.
+    """
+
+    position_m: Tensor
+    quaternion: Tensor

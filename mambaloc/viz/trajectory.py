@@ -1,0 +1,57 @@
+"""The paper's figure: true and predicted trajectory in 3-D, rotation errors as a bar along the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from mambaloc.metrics import PoseErrorTable, summarise
+
+TRUE_COLOR, PREDICTED_COLOR = "#1a9850", "#d73027"
+
+
+def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path, title: str) -> None:
+    """Draw a split's true (green) and predicted (red) camera centres, and rotation errors below.
+
+    Args:
+        table: errors of the split, one row a frame.
+        sequences: each frame's sequence; lines do not cross from one to the next.
+        path: the PNG to write.
+        title: heads the plot, before the medians.
+    """
+    figure = Figure(figsize=(7.0, 7.4), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 1, height_ratios=(14, 1))
+    axes = figure.add_subplot(grid[0], projection="3d")
+    true_m, predicted_m = table.true_position_m.cpu().numpy(), table.predicted_position_m.cpu().numpy()
+    names = np.array(sequences)[table.index.cpu().numpy()]
+    for name in dict.fromkeys(names):
+        rows = names == name
+        axes.plot(*true_m[rows].T, color=TRUE_COLOR, linewidth=1.8)
+    for true, predicted in zip(true_m, predicted_m, strict=True):
+        axes.plot(*np.stack((true, predicted)).T, color=PREDICTED_COLOR, linewidth=0.4, alpha=0.35)
+    axes.scatter(*predicted_m.T, color=PREDICTED_COLOR, s=7, depthshade=False)
+    axes.plot([], [], color=TRUE_COLOR, linewidth=1.8, label="ground truth")
+    axes.scatter([], [], [], color=PREDICTED_COLOR, s=7, label="prediction")
+    axes.legend(loc="upper right", frameon=False)
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    axes.set_aspect("equal")
+
+    summary = summarise(table)
+    axes.set_title(
+        f"{title}\nmedian {summary['position_error_m']:.3f} m, {summary['rotation_error_deg']:.2f}° "
+        f"over {len(table.index)} frames"
+    )
+    bar = figure.add_subplot(grid[1])
+    errors_deg = table.rotation_error_deg.cpu().numpy()
+    top = max(1.0, float(np.percentile(errors_deg, 95)))
+    image = bar.imshow(errors_deg[None], aspect="auto", cmap="viridis", vmin=0, vmax=top, interpolation="nearest")
+    bar.set(yticks=[], xlabel="frame")
+    figure.colorbar(image, ax=bar, label="rotation\nerror [°]", extend="max", ticks=[0, round(top, 1)])
+    partial = path.with_name(f".{path.name}.partial")
+    canvas.print_png(partial)
+    partial.replace(path)

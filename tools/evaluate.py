@@ -1,0 +1,35 @@
+"""Measure a checkpoint: python tools/evaluate.py CHECKPOINT [--out FOLDER] [--data.KEY VALUE ...]."""
+
+from pathlib import Path
+
+from jsonargparse import ArgumentParser
+
+from mambaloc.data import PoseDataModule
+from mambaloc.errors import InputError, exits_cleanly
+from mambaloc.evaluation import evaluate_checkpoint, print_table
+from mambaloc.evaluation.evaluate import data_of
+from mambaloc.models.base import read_checkpoint
+
+
+@exits_cleanly
+def main(argv: list[str] | None = None) -> None:
+    """Evaluate on the data of the training recipe, changed where an option says so."""
+    parser = ArgumentParser(description=__doc__)
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--out", type=Path, help="folder of the result; beside the checkpoint unless given")
+    parser.add_argument("--accelerator", default="auto", help="as Lightning's Trainer takes it")
+    parser.add_class_arguments(PoseDataModule, "data")
+    checkpoint = parser.parse_args(argv, defaults=False).checkpoint
+    if checkpoint is None:
+        raise InputError("evaluate.py needs a checkpoint: evaluate.py RUN/checkpoints/best.ckpt")
+    parser.set_defaults(
+        {f"data.{name}": value for name, value in data_of(read_checkpoint(checkpoint), checkpoint).hparams.items()}
+    )
+    args = parser.parse_args(argv)
+    out = args.out or checkpoint.parent.parent / "evaluation" / checkpoint.stem
+    print_table([evaluate_checkpoint(checkpoint, out, PoseDataModule(**args.data), args.accelerator)])
+    print(f"{out}: metrics.json, predictions.csv, predictions.tum, trajectory.png")
+
+
+if __name__ == "__main__":
+    main()
