@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 from datetime import datetime
@@ -10,18 +9,32 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+from jsonargparse import Namespace
 from lightning.pytorch.callbacks import ModelCheckpoint
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from mambaloc.callbacks import EarlyStopping, OnnxExport, PoseProgressBar, TrajectoryPlot, WallClock
+from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
-from mambaloc.errors import InputError, exits_cleanly
+from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, print_table
 from mambaloc.models import LitPoseRegressor
+from mambaloc.models.base import read_checkpoint
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
 _SUBCOMMANDS = ("fit", "validate", "test", "predict")
+
+
+class SaveRecipe(SaveConfigCallback):
+    """Keep the resolved recipe in the run's folder: it trains the same run again."""
+
+    def save_config(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Write ``config.yaml``; what a resumed run was given goes to ``config_resumed.yaml``."""
+        name = "config_resumed.yaml" if self.config.get("ckpt_path") else "config.yaml"
+        path = Path(trainer.default_root_dir, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.parser.save(self.config, path, skip_none=False, overwrite=True, multifile=False)
 
 
 class RecipeCLI(LightningCLI):
@@ -31,57 +44,85 @@ class RecipeCLI(LightningCLI):
         """Give every run its callbacks, each a section of the recipe."""
         for name, callback in {
             "progress_bar": PoseProgressBar,
-            "checkpoint": ModelCheckpoint,
             "early_stopping": EarlyStopping,
             "wall_clock": WallClock,
             "onnx_export": OnnxExport,
             "trajectory_plot": TrajectoryPlot,
+            "best_checkpoint": ModelCheckpoint,
+            "last_checkpoint": ModelCheckpoint,  # a callback of its own: `save_last` follows the best one only
         }.items():
             parser.add_lightning_class_args(callback, name)
-        parser.set_defaults(
-            {
-                "checkpoint.filename": "best",
-                "checkpoint.monitor": "val/loss",
-                "checkpoint.save_last": True,
-                "checkpoint.save_on_train_epoch_end": True,
-                "checkpoint.enable_version_counter": False,
-            }
-        )
+        for name in ("best", "last"):
+            parser.set_defaults(
+                {
+                    f"{name}_checkpoint.filename": name,
+                    f"{name}_checkpoint.save_on_train_epoch_end": True,
+                    f"{name}_checkpoint.enable_version_counter": False,
+                }
+            )
+        parser.set_defaults({"best_checkpoint.monitor": "val/loss"})
         parser.link_arguments("data.image_size", "model.init_args.image_size")
 
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Refuse a checkpoint that is none before anything reads it."""
+        super().parse_arguments(parser, args)
+        if checkpoint := self.config[self.config["subcommand"]].get("ckpt_path"):
+            read_checkpoint(checkpoint)
+
     def before_instantiate_classes(self) -> None:
-        """Without validation there is no best epoch: keep the last."""
+        """Without validation no epoch is better than another."""
         config = self.config[self.subcommand]
         if config.data.validation == "none":
-            config.checkpoint.monitor = None
+            config.best_checkpoint.save_top_k = 0
 
     def instantiate_trainer(self, **kwargs: Any) -> L.Trainer:
         """Log into the run's folder, unless the recipe names loggers of its own."""
-        config = self.config[self.subcommand].trainer
-        if config.logger in (None, True) and not config.fast_dev_run:
-            run_dir = str(run_directory(self.config[self.subcommand].config or []))
-            loggers = (CSVLogger(run_dir, name="", version=""), TensorBoardLogger(run_dir, name="", version=""))
-            kwargs = {"default_root_dir": run_dir, "logger": list(loggers), **kwargs}
+        config = self.config[self.subcommand]
+        run_dir = str(run_directory(config))
+        kwargs = {"default_root_dir": run_dir, **kwargs}
+        if config.trainer.logger in (None, True) and not config.trainer.fast_dev_run:
+            # TensorBoard first: checkpoints follow its place. A resumed run writes a CSV of its own beside the first.
+            kwargs["logger"] = [TensorBoardLogger(run_dir, name="", version=""), CSVLogger(run_dir, name="metrics")]
         return super().instantiate_trainer(**kwargs)
+
+    def fit(self, model: L.LightningModule, **kwargs: Any) -> None:
+        """Train; an interrupted run says how to go on."""
+        try:
+            self.trainer.fit(model, **{**kwargs, "weights_only": True})
+        except SystemExit:  # Lightning's answer to Ctrl-C
+            last = Path(self.trainer.default_root_dir, "checkpoints", "last.ckpt")
+            if last.is_file():
+                print(f"interrupted: go on with the same command and --ckpt_path {last}", file=sys.stderr)
+            raise
 
     def after_fit(self) -> None:
         """Measure the best and the last epoch on the test split."""
-        checkpoints = Path(self.trainer.checkpoint_callback.dirpath or "")  # type: ignore[union-attr]
         if self.trainer.fast_dev_run or not self.trainer.is_global_zero:  # type: ignore[attr-defined]
             return
-        run_dir = checkpoints.parent
-        found = [p for p in (checkpoints / "best.ckpt", checkpoints / "last.ckpt") if p.is_file()]
-        if results := [evaluate_checkpoint(p, run_dir / "evaluation" / p.stem) for p in found]:
+        run_dir = Path(self.trainer.default_root_dir)
+        found = [path for name in ("best", "last") if (path := run_dir / "checkpoints" / f"{name}.ckpt").is_file()]
+        if results := [evaluate_checkpoint(path, run_dir / "evaluation" / path.stem) for path in found]:
             print_table(results)
-            print(f"{run_dir}: model.onnx, evaluation/{found[0].stem}/trajectory.png, checkpoints, logs, config.yaml")
+            print(f"wrote {run_dir}: evaluation/{found[0].stem}/trajectory.png, model.onnx, checkpoints, config.yaml")
 
 
-def run_directory(recipes: list[Any]) -> Path:
-    """Name this run's folder, ``runs/RECIPE/TIME``; the processes of a distributed run agree on it."""
-    if _RUN_DIR not in os.environ:
-        name = "+".join(Path(str(recipe)).stem for recipe in recipes) or "run"
-        os.environ[_RUN_DIR] = str(Path("runs", name, datetime.now().strftime("%Y%m%d-%H%M%S")))
-    return Path(os.environ[_RUN_DIR])
+def run_directory(config: Namespace) -> Path:
+    """Name a run's folder: a resumed run's own, else ``trainer.default_root_dir``, else ``runs/RECIPE/TIME``.
+
+    The processes that Lightning starts for a distributed run are told by the first one.
+    """
+    if os.environ.get("LOCAL_RANK", "0") != "0" and _RUN_DIR in os.environ:
+        return Path(os.environ[_RUN_DIR])
+    checkpoint = Path(config.get("ckpt_path") or "")
+    if checkpoint.parent.name == "checkpoints":
+        run_dir = checkpoint.parent.parent
+    elif config.trainer.default_root_dir:
+        run_dir = Path(config.trainer.default_root_dir)
+    else:
+        name = "+".join(Path(str(recipe)).stem for recipe in config.config or []) or "run"
+        run_dir = Path("runs", name, datetime.now().strftime("%Y%m%d-%H%M%S"))
+    os.environ[_RUN_DIR] = str(run_dir)
+    return run_dir
 
 
 def recipe_arguments(argv: list[str]) -> list[str]:
@@ -111,15 +152,15 @@ def recipe_arguments(argv: list[str]) -> list[str]:
 @exits_cleanly
 def main(argv: list[str] | None = None) -> RecipeCLI:
     """Run ``tools/train.py``."""
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(
-        lambda record: "litlogger" not in record.getMessage().lower() and "💡" not in record.getMessage()
-    )
+    quieten()
     return RecipeCLI(
         LitPoseRegressor,
         PoseDataModule,
         subclass_mode_model=True,
         args=recipe_arguments(sys.argv[1:] if argv is None else argv),
         seed_everything_default=0,
+        save_config_callback=SaveRecipe,
+        save_config_kwargs={"save_to_log_dir": False},
         trainer_defaults={
             "max_epochs": 600,  # the paper's cap
             "num_sanity_val_steps": 0,

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
+from mambaloc.console import exits_cleanly
 from mambaloc.data.download import describe_sources, download
-from mambaloc.errors import exits_cleanly
 
 
 @exits_cleanly

@@ -4,8 +4,9 @@ from pathlib import Path
 
 from jsonargparse import ArgumentParser
 
+from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
-from mambaloc.errors import InputError, exits_cleanly
+from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, print_table
 from mambaloc.evaluation.evaluate import data_of
 from mambaloc.models.base import read_checkpoint
@@ -14,6 +15,7 @@ from mambaloc.models.base import read_checkpoint
 @exits_cleanly
 def main(argv: list[str] | None = None) -> None:
     """Evaluate on the data of the training recipe, changed where an option says so."""
+    quieten()
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--out", type=Path, help="folder of the result; beside the checkpoint unless given")

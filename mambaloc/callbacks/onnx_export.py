@@ -27,6 +27,6 @@ class OnnxExport(L.Callback):
             return
         assert isinstance(pl_module, LitPoseRegressor)
         best = getattr(trainer.checkpoint_callback, "best_model_path", "")
-        path = Path(trainer.log_dir or trainer.default_root_dir) / "model.onnx"
+        path = Path(trainer.default_root_dir) / "model.onnx"
         parity = export_onnx(load(best) if best else pl_module, path)
         rank_zero_info(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch")

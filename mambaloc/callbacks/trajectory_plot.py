@@ -29,5 +29,5 @@ class TrajectoryPlot(L.Callback):
         table = pl_module.val_errors.table()  # on every rank: it gathers
         if trainer.is_global_zero:
             sequences = trainer.datamodule.frames("val").sequences  # type: ignore[attr-defined]
-            path = Path(trainer.log_dir or trainer.default_root_dir) / "validation.png"
+            path = Path(trainer.default_root_dir) / "validation.png"
             draw_trajectory(table, sequences, path, f"validation, epoch {trainer.current_epoch + 1}")

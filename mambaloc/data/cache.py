@@ -76,7 +76,8 @@ def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_
         bad.reject(paths[row], rule)
     if not meta["rows"]:
         raise InputError(f"{paths[0].parent}: none of {len(paths)} images can be used")
-    return FrameCache(np.load(folder / "images.npy", mmap_mode="r"), np.array(meta["rows"], dtype=np.int64))
+    rows = np.array(meta["rows"], dtype=np.int64)
+    return FrameCache(np.load(folder / "images.npy", mmap_mode="r")[: len(rows)], rows)
 
 
 def _key(paths: Sequence[Path], short_side: int) -> str:
@@ -117,6 +118,7 @@ def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:
                 images = np.lib.format.open_memmap(
                     partial / "images.npy", mode="w+", dtype=np.uint8, shape=(len(paths), *frame.shape)
                 )
+                _claim_space(partial / "images.npy")
             if frame.shape != images.shape[1:]:
                 bad.append((row, f"image is {_size(frame)} after resizing, where the first is {_size(images[0])}"))
                 continue
@@ -126,6 +128,13 @@ def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:
         images.flush()
     (partial / "meta.json").write_text(json.dumps({"rows": rows, "bad": bad, "short_side": short_side}))
     partial.replace(folder)
+
+
+def _claim_space(file: Path) -> None:
+    """Fill a sparse file's holes: writing into them through a memory map on a full disk is a bus error."""
+    if hasattr(os, "posix_fallocate"):
+        with file.open("r+b") as opened:
+            os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
 
 
 def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:
@@ -138,7 +147,10 @@ def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:
         # OpenCV fills what a truncated file lacks with grey and says nothing.
         if data.startswith(start) and end not in data[-_EDGE_BYTES:]:
             return "image is truncated"
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    except cv2.error:  # a damaged header that asks for more than 2^30 pixels
+        image = None
     if image is None:
         return "image cannot be decoded"
     scale = short_side / min(image.shape[:2])

@@ -39,7 +39,7 @@ def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
     """Read the posed frames of one split of a scene's folder.
 
     Raises:
-        InputError: for a missing split file or one without frames; and for a bad frame where ``bad`` says so.
+        InputError: for a missing split file or one without header or frames; and for a bad frame where ``bad`` says so.
     """
     split_file = folder / _SPLIT_FILES[split]
     if not split_file.is_file():
@@ -47,6 +47,9 @@ def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
     lines = split_file.read_text(encoding="utf-8", errors="replace").splitlines()
     images: list[PurePosixPath] = []
     numbers: list[list[float]] = []
+    for row, line in enumerate(lines[:_HEADER_LINES], start=1):
+        if _is_frame(line.split()):
+            raise InputError(f"{split_file}, line {row}: is a frame; put three header lines before it")
     for row, line in enumerate(lines[_HEADER_LINES:], start=_HEADER_LINES + 1):
         if not line.strip():
             continue
@@ -62,6 +65,13 @@ def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
     return Frames(tuple(folder / image for image in images), sequences, poses[:, :3].copy(), quaternion)
 
 
+def _is_frame(words: list[str]) -> bool:
+    try:
+        return len([float(word) for word in words[1:]]) == 7
+    except ValueError:
+        return False
+
+
 def _read_line(folder: Path, where: str, words: list[str], bad: BadFrames) -> list[float] | None:
     """Return the seven numbers of a line; None where it is bad and left out."""
     place = Path(where)
@@ -72,7 +82,7 @@ def _read_line(folder: Path, where: str, words: list[str], bad: BadFrames) -> li
     if len(numbers) != 7:
         return bad.reject(place, f"has {len(numbers)} numbers instead of seven after the image")
     image = PurePosixPath(words[0])
-    if image.is_absolute() or ".." in image.parts:
+    if image.is_absolute() or ".." in image.parts or not image.name:
         return bad.reject(place, "names an image outside the scene's folder")
     if (folder.name, str(image.with_suffix(""))) in KNOWN_BAD_LABELS:
         return bad.reject(folder / image, "is a known bad label of the dataset")

@@ -129,6 +129,14 @@ class PoseDataModule(L.LightningDataModule):
         """Positions of the training frames, (N, 3)."""
         return self._loaded["train"].data.position_m
 
+    def listed_training_frames(self) -> Frames:
+        """Read the whole training split's poses, without decoding an image.
+
+        Raises:
+            InputError: where there is none.
+        """
+        return self._read("train")[0]
+
     def frames(self, part: Part) -> Frames:
         """Return the frames of a part, in the order of ``PoseBatch.index``."""
         return self._loaded[part].data.frames
@@ -186,6 +194,12 @@ class PoseDataModule(L.LightningDataModule):
         cache = cached_frames(
             frames.image_paths, self.hparams["short_side"], bad, Path(cache_dir) if cache_dir else None
         )
+        height, width = cache.images.shape[-2:]
+        if self.crop[0] > height or self.crop[1] > width:
+            raise InputError(
+                f"data.image_size {self.hparams['image_size']}: larger than images resized to {width}x{height}; "
+                "choose a smaller (height, width), or enlarge data.short_side"
+            )
         return LoadedSplit(CachedFrames(frames.select(cache.rows), cache.images), bad)
 
     def _load_train_and_val(self) -> None:
@@ -209,6 +223,9 @@ class PoseDataModule(L.LightningDataModule):
             shuffle=shuffle,
             seed=int(os.environ.get("PL_GLOBAL_SEED", "0")),
         )
+        if trainer and shuffle:
+            # A resumed fit fetches its first batch before Lightning tells the sampler which epoch it is.
+            sampler.set_epoch(trainer.fit_loop.epoch_progress.current.processed)
         return DataLoader(
             data,
             batch_size,

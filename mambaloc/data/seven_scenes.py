@@ -66,6 +66,8 @@ def _listed_sequences(split_file: Path) -> list[int]:
         match = re.fullmatch(r"\s*sequence\s*(\d{1,6})\s*", line, re.IGNORECASE)
         if not match:
             raise InputError(f"{split_file}, line {row}: {line.strip()[:40]!r} is no 'sequenceN'; correct the line")
+        if int(match[1]) in numbers:
+            raise InputError(f"{split_file}, line {row}: lists sequence{int(match[1])} again; remove the line")
         numbers.append(int(match[1]))
     if not numbers:
         raise InputError(f"{split_file}: lists no sequence; add lines 'sequence1', 'sequence2', ...")

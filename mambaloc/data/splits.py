@@ -39,9 +39,13 @@ def hold_out(
         Indices to train on and to validate on, (T,) and (V,).
 
     Raises:
-        InputError: where one of the two would be empty, or a sequence is not there.
+        InputError: where one of the two would be empty, a sequence is not there, or a number is out of range.
     """
     by_sequence = frames.by_sequence()
+    if not sequences and not 0 < fraction < 1:
+        raise InputError(f"data.val_fraction {fraction}: must lie between 0 and 1; or use data.validation: none")
+    if gap < 0:
+        raise InputError(f"data.val_gap {gap}: must be 0 or more, or the two would overlap")
     if sequences or validation == "sequences" or (validation == "auto" and len(by_sequence) > 1):
         held_out = sequences or _last_sequences(by_sequence, round(fraction * len(frames)))
         return _by_sequences(by_sequence, held_out)

@@ -14,6 +14,7 @@ import lightning as L
 from mambaloc import provenance
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
+from mambaloc.evaluation.references import median_training_pose
 from mambaloc.evaluation.trajectories import write_csv, write_tum
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models import LitPoseRegressor, load
@@ -51,7 +52,6 @@ def evaluate_checkpoint(
         enable_checkpointing=False,
         enable_model_summary=False,
         enable_progress_bar=False,
-        barebones=False,
     )
     started = time.perf_counter()
     trainer.test(system, datamodule=data, verbose=False)
@@ -62,6 +62,7 @@ def evaluate_checkpoint(
         "count": len(table.index),
         "data": data.describe(),
         "split": "test",
+        "references": _references(data, table),
         "selection": selection_rule(stored, checkpoint),
         "model": _describe_model(system),
         "training": _describe_training(stored, checkpoint),
@@ -92,18 +93,25 @@ def check_image_size(system: LitPoseRegressor, data: PoseDataModule, checkpoint:
 
 
 def selection_rule(stored: dict[str, Any], checkpoint: Path) -> str:
-    """Say in words how this epoch was chosen."""
-    if checkpoint.stem == "last":
-        return "last epoch"
-    monitor = next((s["monitor"] for n, s in stored["callbacks"].items() if n.startswith("ModelCheckpoint")), None)
-    if monitor is None:
-        return "last epoch"
-    where = "SELECTED ON THE TEST SET" if _validates_on_test(stored) else "on frames held out of the training split"
-    return f"epoch of lowest {monitor}, {where}"
+    """Say how this epoch was chosen: a word or two, and for a chosen one the rule after a colon."""
+    states = [state for name, state in stored["callbacks"].items() if name.startswith("ModelCheckpoint")]
+    monitor = next((state["monitor"] for state in states if state["monitor"]), None)
+    if checkpoint.stem == "last" or monitor is None:
+        return "last"
+    if _validates_on_test(stored):
+        return f"best on TEST: lowest {monitor} ON THE TEST SET, so its errors are not those of unseen frames"
+    return f"best: lowest {monitor} on frames held out of the training split"
 
 
 def _validates_on_test(stored: dict[str, Any]) -> bool:
     return stored.get("datamodule_hyper_parameters", {}).get("validation") == "test_set"
+
+
+def _references(data: PoseDataModule, table: PoseErrorTable) -> dict[str, dict[str, float]]:
+    try:
+        return {"median_training_pose": median_training_pose(data.listed_training_frames(), table)}
+    except InputError:  # a test split alone can be measured too
+        return {}
 
 
 def _describe_model(system: LitPoseRegressor) -> dict[str, Any]:
@@ -143,7 +151,8 @@ def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, data: PoseD
         write_csv(out / "predictions.csv", table, frames)
         write_tum(out / "predictions.tum", table.index, table.predicted_position_m, table.predicted_quaternion)
         write_tum(out / "ground_truth.tum", table.index, table.true_position_m, table.true_quaternion)
-        title = f"{result['model']['name']} on {result['data']['scene']} (test), {result['selection'].split(',')[0]}"
+        chosen = result["selection"].split(":")[0]
+        title = f"{result['model']['name']} on {result['data']['scene']}, test, {chosen} epoch"
         draw_trajectory(table, frames.sequences, out / "trajectory.png", title)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another folder with --out") from None

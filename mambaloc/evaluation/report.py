@@ -12,24 +12,41 @@ from rich.table import Table
 def print_table(results: Sequence[dict[str, Any]]) -> None:
     """Print what :func:`~mambaloc.evaluation.evaluate_checkpoint` returned, a row a checkpoint."""
     data = results[0]["data"]
-    label = f"{data['dataset']}/{data['scene']}, {results[0]['count']} test frames"
-    if not data["official_split"]:
-        label += " (not the benchmark's official split)"
-    table = Table(title=label, title_justify="left")
-    for column in ("checkpoint", "epoch", "median", "mean", "5 cm 5°", "25 cm 2°", "50 cm 5°", "training"):
-        table.add_column(column, justify="left" if column == "checkpoint" else "right")
+    benchmark = "official split" if data["official_split"] else "not an official benchmark split"
+    table = Table(
+        title=f"{data['dataset']}/{data['scene']}: {results[0]['count']} test frames, {benchmark}",
+        title_justify="left",
+    )
+    for column in ("epoch", "", "median", "mean", "5 cm 5°", "25 cm 2°", "50 cm 5°"):
+        table.add_column(column, justify="right", no_wrap=True)
     for result in results:
-        metrics, training = result["metrics"], result["training"]
-        clock = training["wall_clock"]
+        metrics = result["metrics"]
         table.add_row(
-            result["selection"],
-            str(training["epoch"]),
-            f"{metrics['position_error_m']:.3f} m  {metrics['rotation_error_deg']:.2f}°",
-            f"{metrics['position_error_mean_m']:.3f} m  {metrics['rotation_error_mean_deg']:.2f}°",
-            *(f"{metrics[name]:.1%}" for name in ("recall_5cm_5deg", "recall_25cm_2deg", "recall_50cm_5deg")),
-            f"{clock['train_s']:.1f} s" if clock else "-",
+            result["selection"].split(":")[0],
+            str(result["training"]["epoch"]),
+            f"{metrics['position_error_m']:.3f} m {metrics['rotation_error_deg']:5.2f}°",
+            f"{metrics['position_error_mean_m']:.3f} m {metrics['rotation_error_mean_deg']:5.2f}°",
+            *(f"{metrics[name]:.0%}" for name in ("recall_5cm_5deg", "recall_25cm_2deg", "recall_50cm_5deg")),
         )
-    Console().print(table)
+    for name, reference in results[0]["references"].items():
+        medians = f"{reference['position_error_m']:.3f} m {reference['rotation_error_deg']:5.2f}°"
+        table.add_row(f"[dim]{name.replace('_', ' ')}", "", f"[dim]{medians}", *[""] * 4)
+    console = Console(highlight=False)
+    console.print(table)
+    for result in results:
+        if ":" in result["selection"]:
+            console.print(result["selection"])
+    if clock := results[-1]["training"]["wall_clock"]:
+        console.print(_wall_clock_line(clock))
     skipped = {part: sum(counts.values()) for part, counts in data["skipped"].items() if counts}
     if skipped:
-        Console().print("skipped frames: " + ", ".join(f"{part} {count}" for part, count in skipped.items()))
+        console.print("skipped frames: " + ", ".join(f"{part} {count}" for part, count in skipped.items()))
+
+
+def _wall_clock_line(clock: dict[str, Any]) -> str:
+    line = "training {train_s:.1f} s, validation {validation_s:.1f} s, set-up {setup_s:.1f} s".format(**clock)
+    if clock["reach"]:
+        sought = ", ".join(f"{name} {value:g}" for name, value in clock["reach"].items())
+        reached = "never" if clock["reached_s"] is None else f"after {clock['reached_s']:.1f} s"
+        line += f"; validation {sought} reached {reached}"
+    return line

@@ -84,9 +84,13 @@ class LitPoseRegressor(L.LightningModule):
                     module.fit(self.trainer.datamodule.train_position_m)  # type: ignore[attr-defined]
 
     def on_train_epoch_start(self) -> None:
-        """Tie dropout to (seed, epoch, rank), so that a resumed run continues exactly."""
+        """Log the learning rate."""
+        self.log("train/lr", self.optimizers().param_groups[0]["lr"])  # type: ignore[union-attr]
+
+    def on_train_batch_start(self, batch: PoseBatch, batch_idx: int) -> None:
+        """Tie dropout to (seed, step, rank), so that a resumed run continues exactly."""
         seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
-        torch.manual_seed((seed * 1_000_003 + self.current_epoch) * 1_009 + self.global_rank)
+        torch.manual_seed(hash((seed, self.current_epoch, batch_idx, self.global_rank)))
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
@@ -95,10 +99,9 @@ class LitPoseRegressor(L.LightningModule):
         return loss
 
     def on_train_epoch_end(self) -> None:
-        """Log the learned loss weights and the learning rate."""
+        """Log the learned loss weights."""
         for name, parameter in self.loss.named_parameters():
             self.log(f"train/{name}", parameter.detach())
-        self.log("train/lr", self.optimizers().param_groups[0]["lr"])  # type: ignore[union-attr]
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:
         """Collect a validation batch."""
@@ -137,10 +140,11 @@ class LitPoseRegressor(L.LightningModule):
     def configure_optimizers(self) -> dict[str, Any]:
         """Adam and a stepwise learning rate, as the paper prints them."""
         undecayed = {
-            id(getattr(module, name))
+            id(parameter)
             for module in self.modules()
             if hasattr(module, "no_weight_decay")
-            for name in module.no_weight_decay()
+            for name, parameter in module.named_parameters()
+            if name in module.no_weight_decay()  # timm's are dotted, and may name what a model lacks
         }
         trainable = [p for p in self.parameters() if p.requires_grad]
         groups = [

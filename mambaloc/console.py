@@ -1,0 +1,36 @@
+"""What a tool shows a person: a user's mistake as one line, and no chatter."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import warnings
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+from mambaloc.errors import InputError
+
+
+def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a tool's ``main`` print an :class:`InputError` as one line on stderr and exit with code 2."""
+
+    @wraps(main)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return main(*args, **kwargs)
+        except InputError as error:
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+
+    return wrapper
+
+
+def quieten() -> None:
+    """Keep what a user can act on: no hardware lists, tips, nor warnings about the insides of libraries."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", "LightningCLI's args parameter is intended")  # ours are made from sys.argv
+    warnings.filterwarnings("ignore", ".*treespec, LeafSpec")
+    warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")  # a resumed run's own
+    warnings.filterwarnings("ignore", ".*does not have many workers")  # decoded frames need none
