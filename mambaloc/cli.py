@@ -6,7 +6,7 @@ import os
 import sys
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import lightning as L
 from jsonargparse import Namespace
@@ -24,6 +24,18 @@ from mambaloc.models.base import read_checkpoint
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
 _SUBCOMMANDS = ("fit", "validate", "test", "predict")
+
+
+class OneLineErrorParser(LightningArgumentParser):
+    """Parser that answers a wrong option in one line, without its page of usage."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Raise what is wrong as an :class:`~mambaloc.errors.InputError`."""
+        chatter = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
+        lines = [line.strip() for line in str(message).splitlines()]
+        said = " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(chatter))
+        remedy = "; --help lists the options"  # a subcommand's parser reports to its parent, which reports again
+        raise InputError(said.replace("typing.", "").removesuffix(remedy) + remedy)
 
 
 class SaveRecipe(SaveConfigCallback):
@@ -156,7 +168,9 @@ def main(argv: list[str] | None = None) -> RecipeCLI:
     return RecipeCLI(
         LitPoseRegressor,
         PoseDataModule,
+        parser_class=OneLineErrorParser,
         subclass_mode_model=True,
+        auto_configure_optimizers=False,
         args=recipe_arguments(sys.argv[1:] if argv is None else argv),
         seed_everything_default=0,
         save_config_callback=SaveRecipe,

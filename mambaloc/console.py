@@ -19,11 +19,20 @@ def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
             return main(*args, **kwargs)
-        except InputError as error:
-            print(f"error: {error}", file=sys.stderr)
-            raise SystemExit(2) from None
+        except Exception as error:
+            if mistake := _user_mistake(error):
+                print(f"error: {mistake}", file=sys.stderr)
+                raise SystemExit(2) from None
+            raise
 
     return wrapper
+
+
+def _user_mistake(error: BaseException | None) -> InputError | None:
+    """Find an InputError that a library wrapped in an error of its own."""
+    while error is not None and not isinstance(error, InputError):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 def quieten() -> None:

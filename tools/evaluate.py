@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from jsonargparse import ArgumentParser
-
+from mambaloc.cli import OneLineErrorParser
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
@@ -16,7 +15,7 @@ from mambaloc.models.base import read_checkpoint
 def main(argv: list[str] | None = None) -> None:
     """Evaluate on the data of the training recipe, changed where an option says so."""
     quieten()
-    parser = ArgumentParser(description=__doc__)
+    parser = OneLineErrorParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--out", type=Path, help="folder of the result; beside the checkpoint unless given")
     parser.add_argument("--accelerator", default="auto", help="as Lightning's Trainer takes it")

@@ -185,7 +185,8 @@ class PoseDataModule(L.LightningDataModule):
 
     def _read(self, split: Split) -> tuple[Frames, BadFrames]:
         bad = BadFrames(self.hparams["on_bad_frame"])
-        frames = DATASETS[self.hparams["dataset"]].read_split(self.folder, split, bad)
+        folder = self.folder  # first of all: an unknown dataset is told here
+        frames = DATASETS[self.hparams["dataset"]].read_split(folder, split, bad)
         self._listed[split] = len(frames) + len(bad.rejected)
         return frames, bad
 

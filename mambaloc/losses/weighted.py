@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -53,7 +53,7 @@ class LearnedWeights(nn.Module):
         super().__init__()
         self.s_position = nn.Parameter(torch.tensor(float(s_position)))
         self.s_rotation = nn.Parameter(torch.tensor(float(s_rotation)))
-        self.norm, self.nearest_sign = norm, nearest_sign
+        self.norm, self.nearest_sign = _known(norm), nearest_sign
 
     def no_weight_decay(self) -> set[str]:
         """Names of the parameters that an optimiser must not decay."""
@@ -81,9 +81,15 @@ class FixedWeights(nn.Module):
 
     def __init__(self, beta: float = 250.0, norm: Norm = "l2", nearest_sign: bool = False) -> None:
         super().__init__()
-        self.beta, self.norm, self.nearest_sign = beta, norm, nearest_sign
+        self.beta, self.norm, self.nearest_sign = float(beta), _known(norm), nearest_sign
 
     def forward(self, prediction: PosePrediction, target: PoseBatch) -> Tensor:
         """Weigh the two mean distances; a scalar."""
         position_m, rotation = pose_distances(prediction, target, self.norm, self.nearest_sign)
         return position_m + self.beta * rotation
+
+
+def _known(norm: Norm) -> Norm:
+    if norm not in get_args(Norm):  # a recipe's loss_args are not checked before they come here
+        raise ValueError(f"norm is 'l1' or 'l2', not {norm!r}")
+    return norm

@@ -180,8 +180,10 @@ class LitPoseRegressor(L.LightningModule):
         Raises:
             InputError: where the file is missing, is no such checkpoint or holds anything but plain data.
         """
-        read_checkpoint(checkpoint_path)  # refuse with a clear line first
-        kwargs = {"backbone_weights": None, **kwargs, "weights_only": True}
+        checkpoint = read_checkpoint(checkpoint_path)  # refuse with a clear line first
+        if "backbone_weights" in checkpoint.get("hyper_parameters", {}):  # a system may have no such argument
+            kwargs.setdefault("backbone_weights", None)
+        kwargs["weights_only"] = True
         return super().load_from_checkpoint(checkpoint_path, map_location=map_location, **kwargs)
 
 
@@ -198,7 +200,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     except pickle.UnpicklingError as error:
         reason = next((line for line in str(error).splitlines() if "GLOBAL" in line), "not plain tensors").strip()
         raise InputError(f"{path}: refused, since loading it could run code ({reason}); use a trusted export") from None
-    except (OSError, RuntimeError, EOFError, ValueError) as error:
+    except Exception as error:  # torch's unpickler fails on broken files with KeyError, IndexError, struct.error, ...
         raise InputError(f"{path}: not a readable checkpoint ({type(error).__name__}); is it complete?") from None
     if not isinstance(checkpoint, dict) or "mambaloc" not in checkpoint:
         raise InputError(f"{path}: not a MambaLoc checkpoint; give one that a training run wrote")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,8 @@ class Backbone(nn.Module):
             missing, _ = self.body.model.load_state_dict(load_file(path), strict=False)
         except FileNotFoundError:
             raise InputError(f"backbone_weights {path}: no such file; name one, 'timm', or null") from None
-        except (SafetensorError, RuntimeError) as error:
-            reason = str(error).splitlines()[0]
+        except (SafetensorError, RuntimeError, OSError) as error:
+            reason = str(error).splitlines()[-1].strip()  # load_state_dict's first line names no tensor
             raise InputError(f"backbone_weights {path}: does not fit {self.name} ({reason})") from None
         if missing:
             raise InputError(f"backbone_weights {path}: lacks {len(missing)} tensors of {self.name}, as {missing[0]}")
@@ -95,9 +96,11 @@ class Backbone(nn.Module):
 
 def _stages_at(name: str, strides: tuple[int, ...]) -> list[int]:
     """Index the deepest stage of a timm model at each stride."""
+    if list(strides) != sorted(set(strides)):
+        raise ValueError(f"strides rise, as the maps come finest first, not {strides}")
     if not timm.is_model(name):
-        near = ", ".join(timm.list_models(f"*{name.split('_')[0]}*")[:5]) or "see timm.list_models()"
-        raise InputError(f"backbone {name!r}: timm has no such model; near ones: {near}")
+        near = get_close_matches(name, timm.list_models(), n=5) or ["see timm.list_models()"]
+        raise InputError(f"backbone {name!r}: timm has no such model; near ones: {', '.join(near)}")
     try:
         with torch.device("meta"):
             reductions = timm.create_model(name, features_only=True, feature_cls="getter").feature_info.reduction()

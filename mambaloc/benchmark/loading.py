@@ -1,0 +1,101 @@
+"""Frames from the decode-once cache against decoding every frame every epoch, on one core."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import median
+
+import cv2
+import torch
+from PIL import Image
+from rich.progress import track
+from torch import Tensor
+from torchvision import transforms
+
+from mambaloc.data import PoseDataModule
+from mambaloc.data.augmentation import augment, draw_augmentations
+
+_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class LoadingRates:
+    """Images a second, one figure a repetition, of both ways of loading."""
+
+    cached: list[float]
+    decoded: list[float]
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster the cache is, by medians."""
+        return median(self.cached) / median(self.decoded)
+
+
+def measure_loading(data: PoseDataModule, batches: int = 8, repetitions: int = 5) -> LoadingRates:
+    """Time both ways from disk to a normalised, augmented float batch, alternating, after a warm-up of each.
+
+    The reference is what published research code does: PIL, resize, random crop, colour jitter, normalise, a frame at
+    a time. Neither uses a second core.
+
+    Args:
+        data: the scene; its training frames are loaded.
+        batches: batches a repetition.
+        repetitions: timed repetitions of each way.
+    """
+    threads = torch.get_num_threads()
+    data.setup("fit")
+    try:
+        torch.set_num_threads(1)
+        cv2.setNumThreads(1)
+        ways = {"cached": _cached(data), "decoded": _decoded(data)}
+        rates: dict[str, list[float]] = {name: [] for name in ways}
+        for repetition in track(range(repetitions + 1), "Loading", transient=True):
+            for name, load in ways.items():
+                rate = _images_per_second(load, data.hparams["batch_size"], batches, len(data.frames("train")))
+                if repetition:  # the first warms up
+                    rates[name].append(rate)
+    finally:
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(-1)
+    return LoadingRates(**rates)
+
+
+def _images_per_second(load: Callable[[list[int]], Tensor], batch_size: int, batches: int, frames: int) -> float:
+    order = torch.randperm(frames, generator=torch.Generator().manual_seed(0)).tolist()
+    start = time.perf_counter()
+    for batch in range(batches):
+        load([order[(batch * batch_size + i) % frames] for i in range(batch_size)])
+    return batches * batch_size / (time.perf_counter() - start)
+
+
+def _cached(data: PoseDataModule) -> Callable[[list[int]], Tensor]:
+    frames = data.train_dataloader().dataset
+    mean, std = (torch.tensor(values).view(3, 1, 1) for values in (_MEAN, _STD))
+
+    def load(indices: list[int]) -> Tensor:
+        batch = frames.__getitems__(indices)  # type: ignore[attr-defined]
+        how = draw_augmentations(batch.image, data.crop, data.jitter, 0, 0, batch.index)
+        return (augment(batch.image, how, data.crop) - mean) / std
+
+    return load
+
+
+def _decoded(data: PoseDataModule) -> Callable[[list[int]], Tensor]:
+    paths = data.frames("train").image_paths
+    jitter = data.jitter
+    transform = transforms.Compose(
+        [
+            transforms.Resize(data.hparams["short_side"]),
+            transforms.RandomCrop(data.crop),
+            transforms.ColorJitter(jitter.brightness, jitter.contrast, jitter.saturation),
+            transforms.ToTensor(),
+            transforms.Normalize(_MEAN, _STD),
+        ]
+    )
+
+    def load(indices: list[int]) -> Tensor:
+        return torch.stack([transform(Image.open(paths[i]).convert("RGB")) for i in indices])
+
+    return load

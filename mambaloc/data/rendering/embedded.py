@@ -1,0 +1,77 @@
+"""The embedded scene: a small furnished room that is rendered where there is no dataset yet."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from filelock import FileLock
+
+from mambaloc.data.rendering.layouts import GENERATOR_VERSION, scene_note, write_7scenes
+from mambaloc.data.rendering.room import furnished_room
+from mambaloc.data.rendering.shots import Shot, shots_of_sequences
+from mambaloc.data.rendering.trajectories import smooth_trajectory
+from mambaloc.errors import InputError
+
+EMBEDDED_SCENE = "room"
+"""Name of its scene folder."""
+
+_INSIDE_M = ((-1.25, -1.0, 1.1), (1.25, 1.0, 1.7))
+_SIZE = (320, 240)
+_SEED = 0
+_FRAMES = 120  # in a training sequence; half as many in a test sequence
+_STEP_DEG = 2.4  # as if every other frame of a hand-held recording was kept
+_STARTS_DEG = {1: 0.0, 2: 45.0, 3: 90.0, 4: 180.0, 5: 225.0, 6: 270.0}
+_TEST = (2, 5)
+
+
+def ensure_embedded_scene(root: Path) -> Path:
+    """The folder of the embedded scene under ``root``, rendered there on first use (seconds), in the 7-Scenes layout.
+
+    Two processes may call this at once: one renders, the other waits. A scene that another version of the
+    generator made is left alone, and the new one gets another name.
+
+    Raises:
+        InputError: if both names are taken by something else.
+    """
+    shots = embedded_shots()
+    note = scene_note(shots, _SIZE, _SEED)
+    names = (EMBEDDED_SCENE, f"{EMBEDDED_SCENE}-v{GENERATOR_VERSION}")
+    if folder := _rendered(root, names, note):
+        return folder
+    root.mkdir(parents=True, exist_ok=True)
+    with FileLock(root / f".{EMBEDDED_SCENE}.lock"):
+        if folder := _rendered(root, names, note):  # by whoever held the lock before
+            return folder
+        for name in names:
+            if not (root / name).exists():
+                room = furnished_room(_INSIDE_M, _SEED)
+                return write_7scenes(root, name, shots, room=room, size=_SIZE, seed=_SEED)
+    raise InputError(f"{root / names[-1]}: is not what this version renders; remove it, or choose another root")
+
+
+def embedded_shots() -> list[Shot]:
+    """The frames of the embedded scene: four sequences to train on and two to test on, in the same volume."""
+    sequences = {
+        number: smooth_trajectory(
+            _FRAMES // 2 if number in _TEST else _FRAMES,
+            seed=number,
+            inside_m=_INSIDE_M,
+            start_deg=start_deg,
+            step_deg=_STEP_DEG,
+        )
+        for number, start_deg in _STARTS_DEG.items()
+    }
+    return shots_of_sequences(sequences, _TEST, "seq-{sequence:02d}/frame-{frame:06d}.color.jpg")
+
+
+def _rendered(root: Path, names: Iterable[str], note: object) -> Path | None:
+    """The first of the folders whose ``scene.json`` holds this note."""
+    for name in names:
+        try:
+            if json.loads((root / name / "scene.json").read_text()) == note:
+                return root / name
+        except (OSError, ValueError):
+            continue
+    return None

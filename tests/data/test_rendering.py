@@ -1,0 +1,429 @@
+"""Rendered scenes against independent oracles: OpenCV's projection, rays by hand, SciPy's rotations."""
+
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mambaloc.data.rendering import (
+    Room,
+    Shot,
+    default_intrinsics,
+    embedded,
+    embedded_shots,
+    ensure_embedded_scene,
+    furnished_room,
+    layouts,
+    parse_size,
+    quad,
+    read_pose_table,
+    render,
+    room_around,
+    shots_of_sequences,
+    smooth_trajectory,
+    thinned,
+    write_7scenes,
+    write_cambridge,
+)
+from mambaloc.errors import InputError
+
+REPOSITORY = Path(__file__).parents[2]
+TRAJECTORIES = REPOSITORY.parent / "shared" / "data" / "trajectories"
+SIZE = (96, 72)
+K = default_intrinsics(SIZE)
+INSIDE_M = np.array([[-1.25, -1.0, 1.1], [1.25, 1.0, 1.7]])
+RED, GREEN, BLUE, WHITE, GREY = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (90, 90, 90)
+
+
+def flat(colour, size=(64, 64)):
+    return np.full((*size, 3), colour, dtype=np.uint8)
+
+
+def room_of(*quads):
+    return Room(tuple(quads), INSIDE_M)
+
+
+def camera(seed=0):
+    """A pose near the origin that looks roughly along +z, with all angles in play."""
+    rng = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", rng.uniform(-20, 20, 3), degrees=True).as_matrix()
+    pose[:3, 3] = rng.uniform(-0.3, 0.3, 3)
+    return pose
+
+
+def projected(points_m, pose):
+    cam_from_world = np.linalg.inv(pose)
+    rvec = Rotation.from_matrix(cam_from_world[:3, :3]).as_rotvec()
+    return cv2.projectPoints(np.asarray(points_m, dtype=float), rvec, cam_from_world[:3, 3], K, None)[0][:, 0]
+
+
+@pytest.fixture(scope="module")
+def room():
+    return furnished_room(INSIDE_M, seed=0, px_per_m=40)
+
+
+# The renderer
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("seed", range(4))
+def test_marker_appears_where_opencv_projects_it(seed, samples):
+    wall = quad((-5, -5, 3), (10, 0, 0), (0, 10, 0), flat(GREY))
+    marker = quad((-0.4, -0.3, 2.9), (0.8, 0.1, 0), (-0.1, 0.5, -0.3), flat(RED))
+    pose = camera(seed)
+    rgb, _ = render(room_of(wall, marker), K, pose, SIZE, samples)
+    corners = marker.corner_m + np.array([0 * marker.u_m, marker.u_m, marker.u_m + marker.v_m, marker.v_m])
+    outline = projected(corners, pose).astype(np.float32)
+    blend_px = 0.01 if samples == 1 else 0.75  # nearer to the outline a pixel's samples may see both colours
+    for y, x in np.ndindex(rgb.shape[:2]):
+        inside_px = cv2.pointPolygonTest(outline, (x, y), measureDist=True)
+        if abs(inside_px) > blend_px:
+            assert tuple(rgb[y, x]) == (RED if inside_px > 0 else GREY), (x, y, inside_px)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_texture_is_upright_and_sampled_where_opencv_projects_it(seed):
+    texture = np.vstack([np.hstack([flat(RED), flat(GREEN)]), np.hstack([flat(BLUE), flat(WHITE)])])
+    picture = quad((-0.6, -0.4, 3), (1.2, 0, 0.5), (0, 0.9, -0.2), texture)
+    pose = camera(seed)
+    rgb, _ = render(room_of(picture), K, pose, SIZE)
+    for (s, t), colour in {(0.3, 0.3): RED, (0.7, 0.3): GREEN, (0.3, 0.7): BLUE, (0.7, 0.7): WHITE}.items():
+        point = picture.corner_m + s * picture.u_m + t * picture.v_m
+        x, y = np.round(projected([point], pose)[0]).astype(int)
+        assert tuple(rgb[y, x]) == colour
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3])
+def test_depth_is_the_ray_plane_distance_along_the_axis(samples):
+    floor = quad((-9, 1.2, 12), (18, 0, 0), (0, 0, -24), flat(GREY))  # y = 1.2, below the camera, also behind it
+    pose = camera(1)
+    _, depth = render(room_of(floor), K, pose, SIZE, samples)
+    x, y = 50, 66
+    ray = pose[:3, :3] @ np.array([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], 1.0])
+    assert depth[y, x] == pytest.approx((1.2 - pose[1, 3]) / ray[1], rel=1e-4)
+
+
+def test_quad_partly_behind_the_camera_fills_its_part_and_no_more():
+    floor = quad((-50, 1, 50), (100, 0, 0), (0, 0, -100), flat(GREEN))
+    rgb, depth = render(room_of(floor), K, np.eye(4), SIZE)
+    horizon = (SIZE[1] - 1) / 2 + K[1, 1] * 1 / 50
+    assert (rgb[int(horizon) + 2 :] == GREEN).all()
+    assert not rgb[: int(horizon) - 1].any()
+    assert not depth[: int(horizon) - 1].any()
+    assert np.isfinite(depth).all()
+
+
+def test_quads_behind_the_camera_and_backs_are_not_seen():
+    behind = quad((-1, -1, -2), (2, 0, 0), (0, 2, 0), flat(RED))
+    turned_away = quad((1, -1, 2), (-2, 0, 0), (0, 2, 0), flat(RED))
+    rgb, depth = render(room_of(behind, turned_away), K, np.eye(4), SIZE)
+    assert not rgb.any()
+    assert not depth.any()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_nearer_quad_hides_the_farther_whatever_their_order(order):
+    near = quad((-0.5, -0.5, 1), (1, 0, 0), (0, 1, 0), flat(RED))
+    far = quad((-5, -5, 2), (10, 0, 0), (0, 10, 0), flat(BLUE))
+    rgb, depth = render(room_of(*[near, far][::order]), K, np.eye(4), SIZE)
+    assert tuple(rgb[36, 48]) == RED
+    assert depth[36, 48] == pytest.approx(1, rel=1e-5)
+    assert tuple(rgb[2, 2]) == BLUE
+
+
+# Rooms and trajectories
+
+
+def test_room_is_a_function_of_its_seed(room):
+    pose = smooth_trajectory(1, 0, INSIDE_M)[0]
+    same, other = (furnished_room(INSIDE_M, seed, px_per_m=40) for seed in (0, 1))
+    assert all((a.texture == b.texture).all() for a, b in zip(room.quads, same.quads, strict=True))
+    assert (render(room, K, pose, SIZE)[0] == render(same, K, pose, SIZE)[0]).all()
+    assert (render(room, K, pose, SIZE)[0] != render(other, K, pose, SIZE)[0]).any()
+
+
+def test_every_direction_shows_texture_and_no_hole(room):
+    for pose in smooth_trajectory(36, 5, INSIDE_M, step_deg=10):
+        rgb, depth = render(room, K, pose, SIZE)
+        assert rgb.std() > 20
+        assert depth.min() > 0.05
+
+
+def test_furniture_stays_out_of_the_free_box(room):
+    lower, upper = INSIDE_M
+    for q in room.quads:
+        corners = q.corner_m + np.array([0 * q.u_m, q.u_m, q.v_m, q.u_m + q.v_m])
+        assert (corners.max(axis=0) < lower).any() or (corners.min(axis=0) > upper).any()
+
+
+def test_trajectory_is_smooth_upright_and_stays_inside():
+    poses = smooth_trajectory(300, 3, INSIDE_M)
+    assert ((poses[:, :3, 3] >= INSIDE_M[0]) & (poses[:, :3, 3] <= INSIDE_M[1])).all()
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    assert np.allclose(rotations.as_matrix(), poses[:, :3, :3])  # orthonormal, right-handed
+    assert (poses[:, 2, 1] < -0.8).all()  # the camera's y axis points down
+    step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    step_deg = np.degrees((rotations[:-1].inv() * rotations[1:]).magnitude())
+    assert 0.005 < np.median(step_m) < 0.03
+    assert step_m.max() < 0.06
+    assert 0.5 < np.median(step_deg) < 1.5
+    assert step_deg.max() < 3
+    assert not np.allclose(poses, smooth_trajectory(300, 4, INSIDE_M))
+
+
+# Scenes on disk
+
+
+@pytest.fixture
+def shots():
+    poses = {k: smooth_trajectory(3, k, INSIDE_M) for k in (1, 2, 11)}
+    return shots_of_sequences(poses, test=[11])
+
+
+def test_7scenes_scene_reads_back(tmp_path, room, shots):
+    folder = write_7scenes(tmp_path, "den", shots, room=room, size=SIZE, depth=True)
+    assert (folder / "TrainSplit.txt").read_text().split() == ["sequence1", "sequence2"]
+    assert (folder / "TestSplit.txt").read_text().split() == ["sequence11"]
+    assert np.allclose(np.loadtxt(folder / "camera-intrinsics.txt"), K)
+    assert json.loads((folder / "scene.json").read_text())["frames"] == {"train": 6, "test": 3}
+    for shot in shots:
+        image = folder / shot.image
+        assert cv2.imread(str(image)).shape == (72, 96, 3)
+        pose = np.loadtxt(str(image).replace(".color.png", ".pose.txt"))
+        assert np.allclose(pose, shot.world_from_cam, atol=1e-9)
+        assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-8)
+        depth_mm = cv2.imread(str(image).replace(".color.png", ".depth.png"), cv2.IMREAD_UNCHANGED)
+        assert depth_mm.dtype == np.uint16
+        assert np.abs(depth_mm / 1000 - render(room, K, pose, SIZE)[1]).max() < 2e-3
+
+
+def test_same_seed_writes_the_same_bytes(tmp_path, room, shots):
+    first, again, other = (
+        write_7scenes(tmp_path, name, shots, room=room, size=SIZE, seed=seed)
+        for name, seed in (("first", 0), ("again", 0), ("other", 1))
+    )
+    files = [path.relative_to(first) for path in first.rglob("*") if path.is_file()]
+    assert len(files) == 9 * 2 + 4
+    assert all((first / name).read_bytes() == (again / name).read_bytes() for name in files)
+    assert (first / shots[0].image).read_bytes() != (other / shots[0].image).read_bytes()
+
+
+def test_cambridge_labels_are_world_to_camera(tmp_path, room):
+    poses = {1: smooth_trajectory(4, 1, INSIDE_M), 2: smooth_trajectory(2, 2, INSIDE_M)}
+    shots = shots_of_sequences(poses, test=[2], image="seq{sequence}/frame{frame:05d}.png")
+    folder = write_cambridge(tmp_path, "Yard", shots, room=room, size=SIZE)
+    for split, number in (("train", 1), ("test", 2)):
+        lines = (folder / f"dataset_{split}.txt").read_text().splitlines()
+        assert lines[0] == "Visual Landmark Dataset V1"
+        assert lines[1] == "ImageFile, Camera Position [X Y Z W P Q R]"
+        assert lines[2] == ""
+        assert len(lines) == 3 + len(poses[number])
+        for line, world_from_cam in zip(lines[3:], poses[number], strict=True):
+            image, *words = line.split()
+            x, y, z, qw, qx, qy, qz = map(float, words)
+            assert (folder / image).is_file()
+            assert np.allclose([x, y, z], world_from_cam[:3, 3])
+            cam_from_world = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()
+            assert np.allclose(cam_from_world.T, world_from_cam[:3, :3], atol=1e-7)
+
+
+def test_failed_write_leaves_nothing(tmp_path, room, shots, monkeypatch):
+    calls = []
+
+    def breaks_down(*args):
+        calls.append(args)
+        if len(calls) > 4:
+            raise RuntimeError("power cut")
+        return render(*args)
+
+    monkeypatch.setattr(layouts, "render", breaks_down)
+    with pytest.raises(RuntimeError, match="power cut"):
+        write_7scenes(tmp_path, "den", shots, room=room, size=SIZE)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scene_is_never_overwritten(tmp_path, room, shots):
+    (tmp_path / "den").mkdir()
+    with pytest.raises(InputError, match="den: a scene is never overwritten"):
+        write_7scenes(tmp_path, "den", shots, room=room, size=SIZE)
+    assert list((tmp_path / "den").iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b", ".hidden"])
+def test_scene_name_is_a_plain_folder_name(tmp_path, room, shots, name):
+    with pytest.raises(InputError, match="plain name"):
+        write_7scenes(tmp_path, name, shots, room=room, size=SIZE)
+
+
+def test_shots_must_fit_the_7scenes_layout(tmp_path, room, shots):
+    with pytest.raises(InputError, match="named seq-NN"):
+        write_7scenes(tmp_path, "den", [replace(shots[0], image="seq1/frame00001.png")], room=room)
+    with pytest.raises(InputError, match="whole sequences"):
+        write_7scenes(tmp_path, "den", [*shots, replace(shots[0], split="test")], room=room)
+    with pytest.raises(InputError, match="at least one frame"):
+        write_7scenes(tmp_path, "den", [], room=room)
+
+
+# The embedded scene
+
+
+def test_embedded_test_frames_are_near_training_frames_but_not_among_them():
+    shots = embedded_shots()
+    train, test = (np.stack([s.world_from_cam for s in shots if s.split == split]) for split in ("train", "test"))
+    assert (len(train), len(test)) == (480, 120)
+    gap_m = np.linalg.norm(test[:, None, :3, 3] - train[None, :, :3, 3], axis=-1)
+    cosine = (np.einsum("aij,bij->ab", test[:, :3, :3], train[:, :3, :3]) - 1) / 2
+    gap_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    apart = gap_m + gap_deg / 60
+    assert apart.min() > 0.02
+    assert np.median(apart.min(axis=1)) < 0.4
+    azimuth_deg = np.degrees(np.arctan2(train[:, 1, 2], train[:, 0, 2])) % 360
+    assert np.histogram(azimuth_deg, bins=12, range=(0, 360))[0].min() > 10
+
+
+@pytest.fixture
+def quick_embedded(monkeypatch):
+    """The embedded scene with three frames to a split and coarse textures."""
+    few = thinned(embedded_shots(), 3)
+    monkeypatch.setattr(embedded, "embedded_shots", lambda: few)
+    monkeypatch.setattr(embedded, "furnished_room", lambda inside_m, seed: furnished_room(inside_m, seed, px_per_m=30))
+
+
+@pytest.mark.usefixtures("quick_embedded")
+def test_embedded_scene_is_rendered_once_by_whoever_comes_first(tmp_path):
+    with ThreadPoolExecutor(2) as pool:
+        folders = list(pool.map(ensure_embedded_scene, [tmp_path, tmp_path]))
+    stamp = (folders[0] / "scene.json").stat().st_mtime_ns
+    assert folders == [tmp_path / "room"] * 2
+    assert ensure_embedded_scene(tmp_path) == folders[0]
+    assert (folders[0] / "scene.json").stat().st_mtime_ns == stamp
+
+
+@pytest.mark.usefixtures("quick_embedded")
+def test_embedded_scene_of_another_version_is_left_alone(tmp_path):
+    stale, fresh = tmp_path / "room", tmp_path / f"room-v{layouts.GENERATOR_VERSION}"
+    stale.mkdir()
+    (stale / "scene.json").write_text("{}")
+    assert ensure_embedded_scene(tmp_path) == fresh
+    assert ensure_embedded_scene(tmp_path) == fresh
+    assert (stale / "scene.json").read_text() == "{}"
+    (fresh / "scene.json").unlink()
+    with pytest.raises(InputError, match="not what this version renders"):
+        ensure_embedded_scene(tmp_path)
+
+
+# Tables of poses
+
+HEADER = "scene,split,image,x,y,z,qw,qx,qy,qz\n"
+ROW = "den,train,den/seq-01/frame-000000.color.png,1,2,3,2,0,0,0\n"
+
+
+def table(tmp_path, text):
+    path = tmp_path / "poses.csv"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("scene,split,image\n", "line 1: lacks the columns x,y,z"),
+        (HEADER, "has no row of scene 'den'"),
+        (HEADER + ROW + ROW.replace(",1,2", ",one,2"), "line 3: x,y,z,qw,qx,qy,qz must be seven numbers"),
+        (HEADER + "den,train,den/seq-01/frame-000000.color.png,1,2\n", "line 2: x,y,z,qw,qx,qy,qz must be"),
+        (HEADER + ROW.replace(",1,2", ",nan,2"), "line 2: a pose must be finite"),
+        (HEADER + ROW.replace("2,0,0,0", "0,0,0,0"), "line 2: a pose must be finite"),
+        (HEADER + ROW.replace("train", "val"), "line 2: split 'val'"),
+        (HEADER + ROW.replace("den/seq-01", "../seq-01"), "line 2: image"),
+    ],
+)
+def test_bad_table_is_reported_in_one_line(tmp_path, text, says):
+    with pytest.raises(InputError) as caught:
+        read_pose_table(table(tmp_path, text), "den", "7scenes")
+    assert says in str(caught.value)
+    assert "poses.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_table_is_reported(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_pose_table(tmp_path / "none.csv", "den", "7scenes")
+
+
+def test_table_quaternions_follow_the_dataset(tmp_path):
+    half_turns = Rotation.from_rotvec([0.3, -0.5, 0.8])
+    x, y, z, w = half_turns.as_quat()
+    path = table(tmp_path, HEADER + f"den,test,den/seq-03/frame-000007.color.png,1,2,3,{w},{x},{y},{z}\n")
+    for layout, world_from_cam in (("7scenes", half_turns), ("cambridge", half_turns.inv())):
+        (shot,) = read_pose_table(path, "den", layout)
+        assert shot.image == "seq-03/frame-000007.color.png"
+        assert shot.split == "test"
+        assert np.allclose(shot.world_from_cam[:3, :3], world_from_cam.as_matrix())
+        assert np.allclose(shot.world_from_cam[:3, 3], [1, 2, 3])
+
+
+def test_thinning_keeps_both_splits_and_their_ends():
+    shots = [Shot(str(k), split, np.eye(4)) for split in ("test", "train") for k in range(10)]
+    assert [(s.split, s.image) for s in thinned(shots, 3)] == [
+        *[("test", k) for k in ("0", "4", "9")],
+        *[("train", k) for k in ("0", "4", "9")],
+    ]
+    assert len(thinned(shots, 99)) == 20
+    with pytest.raises(InputError, match="limit 0"):
+        thinned(shots, 0)
+
+
+@pytest.mark.parametrize("text", ["320", "0x240", "320x", "axb", "-3x4"])
+def test_size_is_width_by_height(text):
+    assert parse_size("640x480") == (640, 480)
+    with pytest.raises(InputError, match="WIDTHxHEIGHT"):
+        parse_size(text)
+
+
+@pytest.mark.skipif(not TRAJECTORIES.is_dir(), reason="needs ../shared/data/trajectories beside the repository")
+@pytest.mark.parametrize(
+    ("layout", "scene"),
+    [
+        *[("7scenes", s) for s in ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")],
+        *[("cambridge", s) for s in ("KingsCollege", "OldHospital", "ShopFacade", "StMarysChurch")],
+    ],
+)
+def test_real_trajectories_render(tmp_path, layout, scene):
+    shots = thinned(read_pose_table(TRAJECTORIES / f"{layout}.csv", scene, layout), 10)
+    room = room_around(np.stack([s.world_from_cam for s in shots]), seed=0, px_per_m=25)
+    write = write_7scenes if layout == "7scenes" else write_cambridge
+    folder = write(tmp_path, scene, shots, room=room, size=SIZE)
+    assert len(shots) == 20
+    for shot in shots:
+        assert cv2.imread(str(folder / shot.image)).std() > 12
+        _, depth = render(room, K, shot.world_from_cam, SIZE, samples=1)
+        assert np.isfinite(depth).all()
+        assert depth.min() > 0
+
+
+def test_wrong_label_is_kept_and_does_not_blow_up_the_room(tmp_path):
+    poses = smooth_trajectory(60, 0, INSIDE_M)
+    poses[30, :3, 3] = 3e9
+    room = room_around(poses, seed=0, px_per_m=25)
+    assert np.ptp(room.inside_m, axis=0).max() < 4
+    shots = shots_of_sequences({1: poses[28:32]}, test=[])
+    folder = write_7scenes(tmp_path, "den", shots, room=room, size=SIZE)
+    assert np.loadtxt(folder / "seq-01" / "frame-000002.pose.txt")[0, 3] == 3e9
+    assert cv2.imread(str(folder / shots[2].image)).std() > 12
+
+
+def test_tool_reports_a_mistake_in_one_line(tmp_path):
+    tool = REPOSITORY / "tools" / "render_scene.py"
+    command = [sys.executable, str(tool), str(tmp_path), "--poses", str(tmp_path / "none.csv"), "--scene", "den"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1

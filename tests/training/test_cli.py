@@ -1,0 +1,185 @@
+"""What a user types, right and wrong."""
+
+import csv
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+import yaml
+from conftest import REPOSITORY
+
+import mambaloc
+from mambaloc.cli import main, recipe_arguments
+from mambaloc.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run of the tiny recipe, export and plots included."""
+    return tmp_path_factory.mktemp("runs") / "tiny"
+
+
+@pytest.fixture
+def finished(run, tiny_recipe):
+    if not run.exists():
+        options = ["--onnx_export.enabled", "true", "--trajectory_plot.every_n_epochs", "2"]
+        options += ["--wall_clock.reach", '{"position_error_m": 1000}']
+        main([str(tiny_recipe), "--trainer.default_root_dir", str(run), *options])
+    return run
+
+
+def tool(name, *words):
+    command = [sys.executable, REPOSITORY / "tools" / f"{name}.py", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
+
+
+def test_recipes_come_first_and_become_configs(tmp_path):
+    a, b = tmp_path / "a.yaml", tmp_path / "b.yml"
+    a.touch(), b.touch()
+    assert recipe_arguments([str(a), str(b), "--model.lr", "1"]) == [
+        *("fit", "--config", str(a), "--config", str(b)),
+        *("--model.lr", "1"),
+    ]
+    assert recipe_arguments(["test", str(a)]) == ["test", "--config", str(a)]
+
+
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        ([], "a recipe comes first"),
+        (["--model.lr", "1", "a.yaml"], "a recipe comes first"),
+        (["missing.yaml"], "no such recipe"),
+        (["a.yaml", "--model.lr", "1", "b.yaml"], "come before the options"),
+    ],
+)
+def test_misplaced_recipe_is_refused(words, rule, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.yaml").touch(), (tmp_path / "b.yaml").touch()
+    with pytest.raises(InputError, match=rule):
+        recipe_arguments(words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--data.scene", "fire"], ["fire", "tools/download.py 7scenes fire"]),
+        (["--model.gis", "both"], ["gis"]),
+        (["--model.learning_rate", "1"], ["learning_rate"]),
+        (["--model.backbone", "resnet10x"], ["resnet10x", "resnet10t"]),
+        (["--ckpt_path", "nothing.ckpt"], ["nothing.ckpt"]),
+        (["--data.image_size", "64"], ["short_side"]),
+    ],
+)
+def test_mistake_is_one_line_and_exit_code_2(options, words, tiny_recipe, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main([str(tiny_recipe), *options])
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert all(word in error for word in words), error
+    assert len(error.strip().splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_run_leaves_everything(finished):
+    for name in ("config.yaml", "model.onnx", "validation.png", "checkpoints/best.ckpt", "checkpoints/last.ckpt"):
+        assert (finished / name).stat().st_size > 0
+    assert list(finished.glob("events.out.tfevents*"))
+    metrics = json.loads((finished / "evaluation/best/metrics.json").read_text())
+    assert metrics["count"] == 8
+    assert metrics["selection"].startswith("best: lowest val/loss on frames held out")
+    assert metrics["data"]["scene"] == "heads"
+    assert metrics["data"]["official_split"] is False
+    clock = metrics["training"]["wall_clock"]
+    assert 0 < clock["reached_s"] <= clock["train_s"]
+    assert {"commit", "seed", "device", "versions", "recipe_sha256"} <= metrics["training"].keys()
+
+
+@pytest.mark.slow
+def test_predictions_agree_with_metrics(finished):
+    folder = finished / "evaluation/last"
+    with (folder / "predictions.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    errors = torch.tensor([float(row["position_error_m"]) for row in rows])
+    metrics = json.loads((folder / "metrics.json").read_text())["metrics"]
+    assert metrics["position_error_m"] == pytest.approx(errors.quantile(0.5).item(), rel=1e-5)
+    tum = [line.split() for line in (folder / "predictions.tum").read_text().splitlines()[1:]]
+    for line, row in zip(tum, rows, strict=True):
+        expected = [row[f"predicted_{c}"] for c in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
+        assert [float(n) for n in line[1:]] == pytest.approx([float(n) for n in expected])
+
+
+@pytest.mark.slow
+def test_saved_config_retrains_the_same(finished, tmp_path):
+    main([str(finished / "config.yaml"), "--trainer.default_root_dir", str(tmp_path / "again")])
+    weights = [torch.load(r / "checkpoints/last.ckpt", weights_only=True) for r in (finished, tmp_path / "again")]
+    torch.testing.assert_close(weights[0]["state_dict"], weights[1]["state_dict"], rtol=0, atol=0)
+
+
+@pytest.mark.slow
+def test_evaluate_tool_prints_and_writes(finished, tmp_path):
+    checkpoint = finished / "checkpoints/last.ckpt"
+    done = tool("evaluate", checkpoint, "--out", tmp_path / "out", "--data.eval_batch_size", 3)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert "last" in done.stdout
+    assert "median training pose" in done.stdout
+    metrics = [json.loads((f / "metrics.json").read_text())["metrics"] for f in (tmp_path / "out", finished / "evaluation/last")]
+    assert metrics[0] == pytest.approx(metrics[1], rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        (["missing.ckpt"], "missing.ckpt"),
+        (["CHECKPOINT", "--data.image_size", "16"], "trained on (32, 32)"),
+        (["CHECKPOINT", "--data.root", "nowhere"], "nowhere"),
+        (["pyproject.toml"], "pyproject.toml"),
+    ],
+)
+def test_evaluate_tool_used_wrong(words, rule, finished):
+    done = tool("evaluate", *(finished / "checkpoints/last.ckpt" if w == "CHECKPOINT" else w for w in words))
+    assert done.returncode == 2
+    assert rule in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_loaded_system_localises(finished):
+    system = mambaloc.load(finished / "checkpoints/best.ckpt")
+    assert isinstance(system, mambaloc.LitMambaLoc)
+    with torch.inference_mode():
+        prediction = system(torch.rand(2, 3, 32, 32))
+    assert prediction.position_m.shape == (2, 3)
+    assert system.provenance["seed"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("validation", ["none", "test_set"])
+def test_selection_rule_is_written_into_the_result(validation, tiny_recipe, tmp_path):
+    options = ["--data.validation", validation, "--trainer.max_epochs", "1", "--trainer.default_root_dir", str(tmp_path)]
+    main([str(tiny_recipe), *options])
+    results = [json.loads(p.read_text())["selection"] for p in sorted(tmp_path.glob("evaluation/*/metrics.json"))]
+    if validation == "none":
+        assert results == ["last"]
+    else:
+        assert "ON THE TEST SET" in results[0]
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_errors_of_one(tiny_recipe, tmp_path):
+    """DDP over two CPU processes: the medians are those of the whole validation set."""
+    recipe = yaml.safe_load(tiny_recipe.read_text())
+    recipe["trainer"] |= {"devices": 2, "strategy": "ddp", "max_epochs": 1}
+    (tmp_path / "ddp.yaml").write_text(yaml.safe_dump(recipe))
+    run = tmp_path / "run"
+    done = tool("train", tmp_path / "ddp.yaml", "--trainer.default_root_dir", run)
+    assert done.returncode == 0, done.stderr
+    with (run / "metrics/version_0/metrics.csv").open() as file:
+        logged = next(float(r["val/position_error_m"]) for r in csv.DictReader(file) if r["val/position_error_m"])
+    words = ["validate", str(tiny_recipe), "--ckpt_path", str(run / "checkpoints/last.ckpt")]
+    alone = main([*words, "--trainer.logger", "false"]).trainer.callback_metrics["val/position_error_m"].item()
+    assert logged == pytest.approx(alone, rel=1e-5)

@@ -1,0 +1,58 @@
+"""Every shipped recipe runs fit, validate, test and predict, on rendered scenes."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import REPOSITORY
+
+from mambaloc.cli import main
+from mambaloc.data.rendering.layouts import write_cambridge
+from mambaloc.data.rendering.shots import FRAME_CAMBRIDGE, shots_of_sequences
+from mambaloc.data.rendering.trajectories import smooth_trajectory
+
+RECIPES = sorted((REPOSITORY / "recipes").glob("*.yaml"))
+OVERLAYS = sorted((REPOSITORY / "recipes/overlays").glob("*.yaml"))
+
+
+@pytest.fixture(scope="session")
+def cambridge(tmp_path_factory):
+    root = tmp_path_factory.mktemp("cambridge")
+    inside_m = ((-4.0, -4.0, 1.5), (4.0, 4.0, 2.5))
+    sequences = {n: smooth_trajectory(6, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
+    write_cambridge(root, "KingsCollege", shots_of_sequences(sequences, {3}, FRAME_CAMBRIDGE), size=(96, 54))
+    return root
+
+
+def stand_in(recipe: Path, scenes: Path, cambridge: Path) -> list[str]:
+    """Options that put a small rendered scene in the place of data and weights that are not there."""
+    data = yaml.safe_load(recipe.read_text())["data"]
+    options = ["--model.backbone_weights", "null", "--trainer.accelerator", "cpu"]
+    if data["dataset"] == "cambridge":
+        return [*options, "--data.root", str(cambridge), "--data.scene", "KingsCollege"]
+    return [*options, "--data.dataset", "7scenes", "--data.root", str(scenes), "--data.scene", "heads"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
+def test_recipe_runs(recipe, scenes, cambridge, tmp_path):
+    options = [*stand_in(recipe, scenes, cambridge), "--trainer.fast_dev_run", "1", "--data.batch_size", "2"]
+    options += ["--data.val_sequences", "null", "--data.validation", "sequences"]
+    for subcommand in ("fit", "validate", "test", "predict"):
+        cli = main([subcommand, str(recipe), *options, "--trainer.default_root_dir", str(tmp_path)])
+        assert cli.trainer.state.finished
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("overlay", OVERLAYS, ids=lambda path: path.stem)
+def test_overlay_changes_what_it_says(overlay, tiny_recipe, tmp_path):
+    if overlay.stem == "gpu":
+        pytest.skip("needs a CUDA device")
+    plain = main([str(tiny_recipe), "--trainer.fast_dev_run", "1"])
+    cli = main([str(tiny_recipe), str(overlay), "--trainer.fast_dev_run", "1"])
+    changed = yaml.safe_load(overlay.read_text())
+    for section, values in changed.items():
+        for key, value in (values.get("init_args") or values).items():
+            hparams = (cli.model if section == "model" else cli.datamodule).hparams
+            assert hparams[key] == value
+            assert hparams[key] != (plain.model if section == "model" else plain.datamodule).hparams[key]
