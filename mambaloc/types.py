@@ -61,6 +61,11 @@ class PoseBatch:
         return PoseBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
 
 
+def height_and_width(size: int | tuple[int, int]) -> tuple[int, int]:
+    """Read an image size: a square's side, or (height, width)."""
+    return (size, size) if isinstance(size, int) else (size[0], size[1])
+
+
 @dataclass(frozen=True)
 class PosePrediction:
     """What a localiser says of a batch of images.

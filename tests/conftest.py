@@ -1,20 +1,11 @@
 """Data that every test may use: a tiny rendered scene, and recipes small enough to train in seconds."""
 
-import os
-from pathlib import Path
-
 import pytest
-
-# Before anything reads it: tests neither use nor fill the user's caches.
-os.environ.setdefault("OMP_NUM_THREADS", "2")
-
-REPOSITORY = Path(__file__).parent.parent
-SHARED = REPOSITORY.parent / "shared"
 
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_dir(tmp_path_factory):
-    """A cache of its own for the whole session, seen by subprocesses too."""
+    """A cache of the session's own, seen by subprocesses too: tests neither use nor fill the user's."""
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MAMBALOC_CACHE", str(folder))

@@ -9,7 +9,7 @@ from lightning.pytorch.callbacks import RichProgressBar
 class PoseProgressBar(RichProgressBar):
     """Rich progress bar that shows the latest validation medians in metres and degrees."""
 
-    def get_metrics(  # type: ignore[override]
+    def get_metrics(
         self, trainer: L.Trainer, pl_module: L.LightningModule
     ) -> dict[str, int | str | float | dict[str, float]]:
         """Show the training loss and the medians over the validation set."""

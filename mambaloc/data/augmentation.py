@@ -59,7 +59,8 @@ def draw_augmentations(
         rng = np.random.default_rng((seed, epoch, frame))
         corners[row] = rng.integers(0, (height - crop[0] + 1, width - crop[1] + 1))
         spread = np.array([jitter.brightness, jitter.contrast, jitter.saturation])
-        colors[row] = color_matrix(*rng.uniform(1 - spread, 1 + spread), luma_means[row])
+        brightness, contrast, saturation = rng.uniform(1 - spread, 1 + spread)
+        colors[row] = color_matrix(brightness, contrast, saturation, luma_means[row])
     return Augmentations(torch.from_numpy(corners[:, 0]), torch.from_numpy(corners[:, 1]), torch.from_numpy(colors))
 
 

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -105,7 +106,7 @@ def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:
     partial = folder.with_suffix(".partial")  # only this process has it: the lock is held
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
-    images: NDArray[np.uint8] | None = None
+    images: np.memmap[Any, np.dtype[np.uint8]] | None = None
     rows: list[int] = []
     bad: list[tuple[int, str]] = []
     with ThreadPoolExecutor() as pool:

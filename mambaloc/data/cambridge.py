@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import torch
 
-from mambaloc.data.frames import BadFrames, Frames, Split
+from mambaloc.data.frames import BadFrames, Frames, Rejection, Split
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, conjugate
 
@@ -53,10 +53,14 @@ def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
     for row, line in enumerate(lines[_HEADER_LINES:], start=_HEADER_LINES + 1):
         if not line.strip():
             continue
-        pose = _read_line(folder, f"{split_file}, line {row}", line.split(), bad)
-        if pose is not None:
-            images.append(PurePosixPath(line.split()[0]))
-            numbers.append(pose)
+        pose = _read_line(folder, Path(f"{split_file}, line {row}"), line.split())
+        if isinstance(pose, Rejection):
+            bad.reject(pose.path, pose.rule)
+            continue
+        images.append(PurePosixPath(line.split()[0]))
+        numbers.append(pose)
+        if abs(float(np.linalg.norm(pose[3:])) - 1) > _UNIT_TOLERANCE:
+            bad.repair(folder / images[-1], "quaternion of another length than 1, normalised")
     if not images:
         raise InputError(f"{split_file}: has no usable frame after its three header lines")
     poses = np.array(numbers)
@@ -72,27 +76,23 @@ def _is_frame(words: list[str]) -> bool:
         return False
 
 
-def _read_line(folder: Path, where: str, words: list[str], bad: BadFrames) -> list[float] | None:
-    """Return the seven numbers of a line; None where it is bad and left out."""
-    place = Path(where)
+def _read_line(folder: Path, place: Path, words: list[str]) -> list[float] | Rejection:
+    """Read the seven numbers of a line, or return the rule it breaks."""
     try:
         numbers = [float(word) for word in words[1:]]
     except ValueError:
-        return bad.reject(place, "is not an image and seven numbers")
+        return Rejection(place, "is not an image and seven numbers")
     if len(numbers) != 7:
-        return bad.reject(place, f"has {len(numbers)} numbers instead of seven after the image")
+        return Rejection(place, f"has {len(numbers)} numbers instead of seven after the image")
     image = PurePosixPath(words[0])
     if image.is_absolute() or ".." in image.parts or not image.name:
-        return bad.reject(place, "names an image outside the scene's folder")
+        return Rejection(place, "names an image outside the scene's folder")
     if (folder.name, str(image.with_suffix(""))) in KNOWN_BAD_LABELS:
-        return bad.reject(folder / image, "is a known bad label of the dataset")
+        return Rejection(folder / image, "is a known bad label of the dataset")
     if not np.isfinite(numbers).all() or max(map(abs, numbers[:3])) > _FARTHEST_M:
-        return bad.reject(place, f"has a position that is not finite or beyond {_FARTHEST_M:g} m")
-    norm = float(np.linalg.norm(numbers[3:]))
-    if norm < 0.5:
-        return bad.reject(place, "has a quaternion near zero")
+        return Rejection(place, f"has a position that is not finite or beyond {_FARTHEST_M:g} m")
+    if float(np.linalg.norm(numbers[3:])) < 0.5:
+        return Rejection(place, "has a quaternion near zero")
     if not (folder / image).is_file():
-        return bad.reject(folder / image, "pose without image")
-    if abs(norm - 1) > _UNIT_TOLERANCE:
-        bad.repair(folder / image, "quaternion of another length than 1, normalised")
+        return Rejection(folder / image, "pose without image")
     return numbers

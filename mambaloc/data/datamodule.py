@@ -20,7 +20,7 @@ from mambaloc.data.datasets import DATASETS, is_official, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
 from mambaloc.data.splits import Validation, hold_out, subsample
 from mambaloc.errors import InputError
-from mambaloc.types import PoseBatch
+from mambaloc.types import PoseBatch, height_and_width
 
 Part = Literal["train", "val", "test"]
 
@@ -100,7 +100,7 @@ class PoseDataModule(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
-        self.crop = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+        self.crop = height_and_width(image_size)
         if max(self.crop) > short_side and min(self.crop) > short_side:
             raise InputError(f"data.image_size {image_size}: larger than data.short_side {short_side}; enlarge that")
         self.jitter = Jitter(brightness, contrast, saturation)
@@ -217,7 +217,7 @@ class PoseDataModule(L.LightningDataModule):
     def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._loaded[part].data, self.trainer
         # One sampler everywhere: Lightning gives it the epoch, so order depends on (seed, epoch) alone.
-        sampler = DistributedSampler(
+        sampler: DistributedSampler[PoseBatch] = DistributedSampler(
             data,
             num_replicas=trainer.world_size if trainer else 1,
             rank=trainer.global_rank if trainer else 0,
@@ -226,13 +226,13 @@ class PoseDataModule(L.LightningDataModule):
         )
         if trainer and shuffle:
             # A resumed fit fetches its first batch before Lightning tells the sampler which epoch it is.
-            sampler.set_epoch(trainer.fit_loop.epoch_progress.current.processed)
+            sampler.set_epoch(trainer.fit_loop.epoch_progress.current.processed)  # type: ignore[attr-defined]
         return DataLoader(
             data,
             batch_size,
             sampler=sampler,
             num_workers=self.hparams["num_workers"],
-            collate_fn=_as_fetched,
+            collate_fn=_as_fetched,  # type: ignore[arg-type]
             pin_memory=torch.cuda.is_available(),
             persistent_workers=self.hparams["num_workers"] > 0,
         )

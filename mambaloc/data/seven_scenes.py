@@ -90,24 +90,26 @@ def _posed_images(sequence: Path, bad: BadFrames) -> list[tuple[Path, NDArray[np
             bad.reject(images[stem], "image without pose")
         elif stem not in images:
             bad.reject(poses[stem], "pose without image")
-        elif (matrix := _read_matrix(poses[stem], bad)) is not None:
+        elif isinstance(matrix := _read_matrix(poses[stem]), str):
+            bad.reject(poses[stem], matrix)
+        else:
             posed.append((images[stem], matrix))
     return posed
 
 
-def _read_matrix(path: Path, bad: BadFrames) -> NDArray[np.float64] | None:
-    """Read a 4x4 camera-to-world matrix; None where it is bad and left out."""
+def _read_matrix(path: Path) -> NDArray[np.float64] | str:
+    """Read a 4x4 camera-to-world matrix, or return the rule it breaks."""
     try:
         rows = [[float(word) for word in line.split()] for line in path.read_text().splitlines() if line.strip()]
     except (ValueError, OSError):  # UnicodeDecodeError is a ValueError
-        return bad.reject(path, "pose is not a text of numbers")
+        return "pose is not a text of numbers"
     if len(rows) != 4 or any(len(row) != 4 for row in rows):
-        return bad.reject(path, f"pose is not a 4x4 matrix but has rows of {[len(row) for row in rows][:6]}")
+        return f"pose is not a 4x4 matrix but has rows of {[len(row) for row in rows][:6]}"
     matrix = np.array(rows)
     if not np.isfinite(matrix).all():
-        return bad.reject(path, "pose has NaN or infinite numbers")
+        return "pose has NaN or infinite numbers"
     if not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
-        return bad.reject(path, "pose's last row is not 0 0 0 1")
+        return "pose's last row is not 0 0 0 1"
     if not is_rotation(torch.from_numpy(matrix[:3, :3]), tolerance=1e-2):
-        return bad.reject(path, "pose's rotation is not orthonormal")
+        return "pose's rotation is not orthonormal"
     return matrix

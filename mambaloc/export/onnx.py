@@ -19,6 +19,7 @@ from torch.export import Dim
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
+from mambaloc.nn import PositionScale
 
 OPSET = 18
 _CHECKED_BATCHES = (1, 3)
@@ -49,9 +50,7 @@ class DeployedNetwork(nn.Module):
         return prediction.position_m, canonical(prediction.quaternion)
 
 
-def export_onnx(
-    system: LitPoseRegressor, path: Path, tolerance_m: float = 1e-3, tolerance_deg: float = 0.05
-) -> Parity:
+def export_onnx(system: LitPoseRegressor, path: Path, tolerance_m: float = 1e-3, tolerance_deg: float = 0.05) -> Parity:
     """Write a system's network as ONNX, with any batch size, and check it in ONNX Runtime.
 
     Args:
@@ -139,5 +138,5 @@ def _quiet():  # type: ignore[no-untyped-def]
 
 
 def _largest_position_m(deployed: nn.Module) -> float:
-    scales = [m.scale_m.item() + m.mean_m.norm().item() for m in deployed.modules() if hasattr(m, "scale_m")]
+    scales = [m.scale_m.item() + m.mean_m.norm().item() for m in deployed.modules() if isinstance(m, PositionScale)]
     return max(scales, default=1.0)

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self
 
 import lightning as L
 import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from mambaloc import provenance
@@ -18,7 +19,7 @@ from mambaloc.errors import InputError
 from mambaloc.losses import build_loss
 from mambaloc.metrics import PoseErrors
 from mambaloc.nn.heads import PositionScale
-from mambaloc.types import PoseBatch, PosePrediction
+from mambaloc.types import PoseBatch, PosePrediction, height_and_width
 
 
 class LitPoseRegressor(L.LightningModule):
@@ -54,7 +55,7 @@ class LitPoseRegressor(L.LightningModule):
         normalise_position: bool = False,
     ) -> None:
         super().__init__()
-        self.image_size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+        self.image_size = height_and_width(image_size)
         self.loss = build_loss(loss, loss_args)
         self.lr, self.weight_decay, self.lr_step_epochs, self.lr_gamma = lr, weight_decay, lr_step_epochs, lr_gamma
         self.normalise_position = normalise_position
@@ -137,14 +138,14 @@ class LitPoseRegressor(L.LightningModule):
         """Forget the previous test."""
         self.test_errors.reset()
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """Adam and a stepwise learning rate, as the paper prints them."""
         undecayed = {
             id(parameter)
             for module in self.modules()
             if hasattr(module, "no_weight_decay")
             for name, parameter in module.named_parameters()
-            if name in module.no_weight_decay()  # timm's are dotted, and may name what a model lacks
+            if name in module.no_weight_decay()  # type: ignore[operator]  # timm's are dotted, and may name what a model lacks
         }
         trainable = [p for p in self.parameters() if p.requires_grad]
         groups = [

@@ -60,7 +60,7 @@ class MambaLoc(nn.Module):
         self.backbone = Backbone(backbone, (8, 16), backbone_weights, backbone_args, pixel_mean, pixel_std)
         (orientation_grid, position_grid) = self.backbone.grids(image_size)
         (orientation_channels, position_channels) = self.backbone.channels
-        encoder = {
+        encoder: dict[str, Any] = {
             "dim": dim,
             "layers": encoder_layers,
             "heads": heads,

@@ -33,6 +33,10 @@ class Backbone(nn.Module):
         InputError: for an unknown model, strides that it does not have, or weights that do not fit.
     """
 
+    body: Any
+    pixel_mean: Tensor
+    pixel_std: Tensor
+
     def __init__(
         self,
         name: str,
@@ -103,7 +107,8 @@ def _stages_at(name: str, strides: tuple[int, ...]) -> list[int]:
         raise InputError(f"backbone {name!r}: timm has no such model; near ones: {', '.join(near)}")
     try:
         with torch.device("meta"):
-            reductions = timm.create_model(name, features_only=True, feature_cls="getter").feature_info.reduction()
+            model: Any = timm.create_model(name, features_only=True, feature_cls="getter")
+        reductions = model.feature_info.reduction()
     except (RuntimeError, AttributeError, NotImplementedError) as error:
         raise InputError(f"backbone {name!r}: timm offers no feature maps of it ({error})") from None
     lacking = [stride for stride in strides if stride not in reductions]

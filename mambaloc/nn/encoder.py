@@ -68,8 +68,9 @@ class EncoderLayer(nn.Module):
             nn.Linear(dim, feedforward), nn.GELU(), nn.Dropout(dropout), nn.Linear(feedforward, dim)
         )
         self.dropout = nn.Dropout(dropout)
-        for linear in (self.qk, self.v, self.out, self.mlp[0], self.mlp[3]):
-            nn.init.xavier_uniform_(linear.weight)
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.xavier_uniform_(module.weight)
 
     def forward(self, tokens_BND: Tensor, positions_ND: Tensor) -> Tensor:
         """Attend, then transform each token; both around a residual."""
@@ -78,9 +79,7 @@ class EncoderLayer(nn.Module):
 
     def _attend(self, tokens_BND: Tensor, positions_ND: Tensor) -> Tensor:
         query_BND, key_BND = self.qk(tokens_BND + positions_ND).chunk(2, dim=-1)
-        q, k, v = (
-            t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (query_BND, key_BND, self.v(tokens_BND))
-        )
+        q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (query_BND, key_BND, self.v(tokens_BND)))
         dropout = self.attention_dropout if self.training else 0.0
         attended = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout)
         return self.out(attended.transpose(1, 2).flatten(2))

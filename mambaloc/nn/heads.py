@@ -26,6 +26,9 @@ class PositionScale(nn.Module):
         (B, 3) -> (B, 3) in metres.
     """
 
+    mean_m: Tensor
+    scale_m: Tensor
+
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("mean_m", torch.zeros(3))

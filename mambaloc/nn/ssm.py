@@ -122,6 +122,7 @@ class MambaMixer(nn.Module):
         """
         w_in, w_gate = self.in_proj.weight.chunk(2)
         u0_BE, u1_BE = F.linear(first_BD, w_in), F.linear(last_BD, w_in)
+        assert self.conv1d.bias is not None
         previous_E, current_E = self.conv1d.weight[:, 0, -2], self.conv1d.weight[:, 0, -1]
         x0_BE = F.silu(current_E * u0_BE + self.conv1d.bias)
         x1_BE = F.silu(previous_E * u0_BE + current_E * u1_BE + self.conv1d.bias)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from mambaloc.metrics import PoseErrorTable, summarise
 
@@ -38,7 +39,14 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
     axes.plot([], [], color=TRUE_COLOR, linewidth=1.8, label="ground truth")
     axes.scatter([], [], [], color=PREDICTED_COLOR, s=7, label="prediction")
     axes.legend(loc="upper right", frameon=False)
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    low_m, high_m = np.vstack((true_m, predicted_m)).min(0), np.vstack((true_m, predicted_m)).max(0)
+    half_m = np.maximum((high_m - low_m) / 2, 0.25 * (high_m - low_m).max())  # a flat path still gets a box to lie in
+    limits_m = np.stack(((low_m + high_m) / 2 - half_m, (low_m + high_m) / 2 + half_m), axis=1)
+    axes.set(xlim=limits_m[0], ylim=limits_m[1], zlim=limits_m[2])
+    for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", strict=True):
+        axis.set_major_locator(MaxNLocator(5))
+        axis.set_label_text(f"{name} [m]")
+        axis.labelpad = 8
     axes.set_aspect("equal")
 
     summary = summarise(table)

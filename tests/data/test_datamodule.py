@@ -215,6 +215,7 @@ def test_workers_give_the_same_batches(make):
         loader = module.train_dataloader()
         loader.sampler.set_epoch(1)
         batches.append(list(loader))
+        del loader  # which stops its workers
     assert len(batches[0]) == len(batches[1]) == 4
     for alone, by_worker in zip(*batches, strict=True):
         for name in ("image", "position_m", "quaternion", "index"):

@@ -22,11 +22,11 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from mambaloc.data import download as download_module
-from mambaloc.data.archives import require_space, unpack
 from mambaloc.data.download import Archive, Source, describe_sources, download, how_to_get
-from mambaloc.data.fetch import fetch
-from mambaloc.data.origins import CAMBRIDGE, SEVENSCENES, SOURCES
+from mambaloc.data.download import scene as download_module
+from mambaloc.data.download.archives import require_space, unpack
+from mambaloc.data.download.fetch import fetch
+from mambaloc.data.download.origins import CAMBRIDGE, SEVENSCENES, SOURCES
 from mambaloc.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]

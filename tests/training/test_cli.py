@@ -4,15 +4,17 @@ import csv
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 import yaml
-from conftest import REPOSITORY
 
 import mambaloc
 from mambaloc.cli import main, recipe_arguments
 from mambaloc.errors import InputError
+
+REPOSITORY = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +128,10 @@ def test_evaluate_tool_prints_and_writes(finished, tmp_path):
     assert done.stderr == ""
     assert "last" in done.stdout
     assert "median training pose" in done.stdout
-    metrics = [json.loads((f / "metrics.json").read_text())["metrics"] for f in (tmp_path / "out", finished / "evaluation/last")]
+    metrics = [
+        json.loads((f / "metrics.json").read_text())["metrics"]
+        for f in (tmp_path / "out", finished / "evaluation/last")
+    ]
     assert metrics[0] == pytest.approx(metrics[1], rel=1e-4)
 
 
@@ -160,7 +165,14 @@ def test_loaded_system_localises(finished):
 @pytest.mark.slow
 @pytest.mark.parametrize("validation", ["none", "test_set"])
 def test_selection_rule_is_written_into_the_result(validation, tiny_recipe, tmp_path):
-    options = ["--data.validation", validation, "--trainer.max_epochs", "1", "--trainer.default_root_dir", str(tmp_path)]
+    options = [
+        "--data.validation",
+        validation,
+        "--trainer.max_epochs",
+        "1",
+        "--trainer.default_root_dir",
+        str(tmp_path),
+    ]
     main([str(tiny_recipe), *options])
     results = [json.loads(p.read_text())["selection"] for p in sorted(tmp_path.glob("evaluation/*/metrics.json"))]
     if validation == "none":

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import REPOSITORY
 
 from mambaloc.cli import main
 from mambaloc.data.rendering.layouts import write_cambridge
 from mambaloc.data.rendering.shots import FRAME_CAMBRIDGE, shots_of_sequences
 from mambaloc.data.rendering.trajectories import smooth_trajectory
+
+REPOSITORY = Path(__file__).parents[2]
 
 RECIPES = sorted((REPOSITORY / "recipes").glob("*.yaml"))
 OVERLAYS = sorted((REPOSITORY / "recipes/overlays").glob("*.yaml"))

@@ -5,13 +5,15 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
-from conftest import REPOSITORY
 
 from mambaloc.cli import main
 from mambaloc.models.base import read_checkpoint
+
+REPOSITORY = Path(__file__).parents[2]
 
 
 def epochs_of(run):

@@ -22,12 +22,10 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
-from mambaloc.data.archives import require_space, unpack
-from mambaloc.data.fetch import UnreachableError, fetch
-from mambaloc.data.origins import SOURCES, Archive, Source, describe_sources, find_scene, find_source, how_to_get
+from mambaloc.data.download.archives import require_space, unpack
+from mambaloc.data.download.fetch import UnreachableError, fetch
+from mambaloc.data.download.origins import Archive, Source, find_scene, find_source
 from mambaloc.errors import InputError
-
-__all__ = ["SOURCES", "Archive", "Source", "describe_sources", "download", "how_to_get"]
 
 _UNPACKED_PER_BYTE = 1.2  # images hardly compress; the margin holds one inner zip
 _MOST_UNPACKED_PER_BYTE = 10

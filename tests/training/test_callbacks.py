@@ -1,0 +1,93 @@
+"""What happens around training."""
+
+import csv
+from types import SimpleNamespace
+
+import cv2
+import pytest
+import torch
+
+from mambaloc.callbacks import PoseProgressBar, WallClock, wall_clock
+from mambaloc.cli import main
+from mambaloc.errors import InputError
+
+CPU = SimpleNamespace(device=torch.device("cpu"), log=lambda *_, **__: None)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that a test moves by hand."""
+    now = SimpleNamespace(s=100.0)
+    monkeypatch.setattr(wall_clock.time, "perf_counter", lambda: now.s)
+    return now
+
+
+def epoch(callback, trainer, clock, train_s, validation_s, afterwards_s):
+    callback.on_train_epoch_start(trainer, CPU)
+    clock.s += train_s
+    callback.on_validation_start(trainer, CPU)
+    clock.s += validation_s
+    callback.on_validation_end(trainer, CPU)
+    clock.s += 0.5  # the end of the training epoch
+    callback.on_train_epoch_end(trainer, CPU)
+    clock.s += afterwards_s  # checkpoints: nobody's
+
+
+def trainer_at(position_error_m):
+    metrics = {"val/position_error_m": torch.tensor(position_error_m)}
+    return SimpleNamespace(sanity_checking=False, callback_metrics=metrics)
+
+
+def test_wall_clock_keeps_training_apart_and_survives_a_resume(clock):
+    first = WallClock(reach={"position_error_m": 0.2})
+    clock.s += 7
+    first.on_train_start(trainer_at(1.0), CPU)
+    epoch(first, trainer_at(0.3), clock, train_s=10, validation_s=3, afterwards_s=50)
+    assert first.state_dict() == {
+        **{"setup_s": 7, "train_s": 10.5, "validation_s": 3},
+        **{"reached_s": None, "reach": {"position_error_m": 0.2}},
+    }
+    second = WallClock(reach={"position_error_m": 0.2})
+    second.load_state_dict(first.state_dict())
+    clock.s += 4
+    second.on_train_start(trainer_at(1.0), CPU)
+    epoch(second, trainer_at(0.2), clock, train_s=20, validation_s=1, afterwards_s=0)
+    epoch(second, trainer_at(0.1), clock, train_s=20, validation_s=1, afterwards_s=0)
+    assert second.seconds == {"setup_s": 11, "train_s": 51.5, "validation_s": 5}
+    assert second.reached_s == 30.5
+
+
+def test_wall_clock_refuses_a_metric_that_is_not_there(clock):
+    callback = WallClock(reach={"position": 0.2})
+    with pytest.raises(InputError, match="'position'"):
+        callback.on_validation_end(trainer_at(0.3), CPU)
+
+
+def test_progress_bar_shows_metres_and_degrees():
+    names = {"train/loss": -1.25, "val/position_error_m": 0.1234, "val/rotation_error_deg": 5.678}
+    trainer = SimpleNamespace(callback_metrics={name: torch.tensor(value) for name, value in names.items()})
+    assert PoseProgressBar().get_metrics(trainer, CPU) == {"loss": "-1.250", "val": "0.123 m 5.68 deg"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("patience", "epochs"), [(2, 3), (0, 5)])
+def test_early_stopping_waits_for_its_patience(patience, epochs, tiny_recipe, tmp_path):
+    options = ["--early_stopping.patience", str(patience), "--early_stopping.min_delta", "1e9"]
+    main([str(tiny_recipe), *options, "--trainer.max_epochs", "5", "--trainer.default_root_dir", str(tmp_path / "run")])
+    with (tmp_path / "run/metrics/version_0/metrics.csv").open() as file:
+        assert max(int(row["epoch"]) for row in csv.DictReader(file)) + 1 == epochs
+
+
+@pytest.mark.slow
+def test_trajectory_plot_is_drawn_when_due(tiny_recipe, tmp_path):
+    run = tmp_path / "run"
+    options = ["--trajectory_plot.every_n_epochs", "2", "--trainer.default_root_dir", str(run)]
+    main([str(tiny_recipe), *options, "--trainer.max_epochs", "1"])
+    assert not (run / "validation.png").exists()
+    main([str(tiny_recipe), *options, "--ckpt_path", str(run / "checkpoints/last.ckpt"), "--trainer.max_epochs", "2"])
+    image = cv2.imread(str(run / "validation.png"))
+    green, red = (
+        cv2.inRange(image, *(tuple(c + d for c in bgr) for d in (-12, 12))) for bgr in ((80, 152, 26), (39, 48, 215))
+    )
+    assert green.any()
+    assert red.any()
