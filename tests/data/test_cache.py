@@ -308,7 +308,7 @@ def open_at_once(images: list[Path], store: Path, barrier, out: Path) -> None:
         build(*args)
 
     cache._build = noting_build
-    barrier.wait(60)
+    barrier.wait(300)
     np.save(out, cached_frames(images, 24, BadFrames(), store).images)
 
 
@@ -320,33 +320,33 @@ def test_two_processes_build_it_once(images, store, tmp_path):
     for process in processes:
         process.start()
     for process in processes:
-        process.join(60)
+        process.join(300)
         assert process.exitcode == 0
     assert len(list(tmp_path.glob("*.built"))) == 1
     for out in outs:
         np.testing.assert_array_equal(np.load(out), [as_rgb_planes(noise(n)) for n in range(4)])
 
 
-SLOW_BUILD = """
-import sys, time, cv2
+STUCK_BUILD = """
+import itertools, sys, time, cv2
 from pathlib import Path
 from mambaloc.data.cache import cached_frames
 from mambaloc.data.frames import BadFrames
-decode = cv2.imdecode
-cv2.imdecode = lambda *args: time.sleep(0.1) or decode(*args)
+decode, calls = cv2.imdecode, itertools.count()
+cv2.imdecode = lambda *args: time.sleep(600 * (next(calls) > 4)) or decode(*args)
 cached_frames([Path(p) for p in sys.argv[2:]], 24, BadFrames(), Path(sys.argv[1]))
 """
 
 
 def test_a_killed_build_leaves_nothing_that_is_read(tmp_path, store):
-    paths = [tmp_path / f"{number}.png" for number in range(100)]
+    paths = [tmp_path / f"{number}.png" for number in range(20)]
     for number, path in enumerate(paths):
         cv2.imwrite(str(path), noise(number))
-    builder = subprocess.Popen([sys.executable, "-c", SLOW_BUILD, store, *paths])
+    builder = subprocess.Popen([sys.executable, "-c", STUCK_BUILD, store, *paths])
     try:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 300
         while not list(store.glob("frames/*.partial/images.npy")):
-            assert builder.poll() is None, "the build ended before it could be killed"
+            assert builder.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.005)
     finally:
@@ -356,7 +356,7 @@ def test_a_killed_build_leaves_nothing_that_is_read(tmp_path, store):
     assert leftover.endswith(".partial")
     (store / "frames" / leftover / "old").touch()
     found = cached_frames(paths, 24, BadFrames(), store)
-    np.testing.assert_array_equal(found.images, [as_rgb_planes(noise(n)) for n in range(100)])
+    np.testing.assert_array_equal(found.images, [as_rgb_planes(noise(n)) for n in range(20)])
     assert caches(store) == {leftover.removesuffix(".partial")}
     (folder,) = (path for path in (store / "frames").iterdir() if path.is_dir())
     assert {path.name for path in folder.iterdir()} == {"images.npy", "meta.json"}
