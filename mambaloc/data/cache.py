@@ -65,13 +65,15 @@ def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_
     """
     root = (cache_dir or default_cache_dir()) / "frames"
     folder = root / _key(paths, short_side)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder.with_suffix(".lock")):
-            if not folder.is_dir():
-                _build(folder, paths, short_side)
-    except OSError as error:
-        raise InputError(f"{root}: the frame cache cannot be written ({error}); set MAMBALOC_CACHE elsewhere") from None
+    if not folder.is_dir():
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+            with FileLock(folder.with_suffix(".lock")):
+                if not folder.is_dir():  # another process may have built it meanwhile
+                    _build(folder, paths, short_side)
+        except OSError as error:
+            message = f"{root}: the frame cache cannot be written ({error}); set MAMBALOC_CACHE elsewhere"
+            raise InputError(message) from None
     meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
     for row, rule in meta["bad"]:
         bad.reject(paths[row], rule)

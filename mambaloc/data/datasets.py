@@ -56,7 +56,9 @@ def scene_folder(dataset: str, root: Path | None, scene: str) -> Path:
 def is_official(dataset: str, scene: str, listed: dict[str, int]) -> bool:
     """Whether the splits read so far (``train``, ``test``) have the frame counts of the official benchmark."""
     official = DATASETS[dataset].official_counts.get(scene)
-    return official is not None and all(official[split == "test"] == count for split, count in listed.items())
+    if official is None or not listed:
+        return False
+    return all(official[split == "test"] == count for split, count in listed.items())
 
 
 __all__ = ["DATASETS", "Dataset", "is_official", "scene_folder"]

@@ -16,7 +16,7 @@ class RegressionHead(nn.Sequential):
     def __init__(self, dim: int, hidden: int, outputs: int) -> None:
         super().__init__(nn.Linear(dim, hidden), nn.GELU(), nn.Linear(hidden, outputs))
 
-    def forward(self, feats_BD: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(self, feats_BD: Tensor) -> Tensor:
         """Regress in float32 even under autocast: bfloat16 would round to 4 mm in a metre."""
         device = feats_BD.device.type
         if not torch.is_autocast_enabled(device):

@@ -1,0 +1,37 @@
+import subprocess
+import sys
+
+import pytest
+
+from mambaloc.console import exits_cleanly
+from mambaloc.errors import InputError
+
+
+@exits_cleanly
+def tool(error):
+    raise error
+
+
+def test_input_error_is_one_line_and_exit_code_2(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        tool(InputError("a.txt: is empty; fill it"))
+    assert exit_.value.code == 2
+    assert capsys.readouterr().err == "error: a.txt: is empty; fill it\n"
+
+
+def test_input_error_inside_a_librarys_error_is_found(capsys):
+    wrapper = ValueError("does not validate")
+    wrapper.__cause__ = InputError("a.txt: is empty; fill it")
+    with pytest.raises(SystemExit):
+        tool(wrapper)
+    assert capsys.readouterr().err == "error: a.txt: is empty; fill it\n"
+
+
+def test_a_bug_keeps_its_traceback():
+    with pytest.raises(ZeroDivisionError):
+        tool(ZeroDivisionError())
+
+
+def test_package_alone_imports_without_torch():
+    code = "import sys, mambaloc; assert mambaloc.__version__; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
