@@ -1,0 +1,153 @@
+"""Every registered system through its whole life, in every GIS mode."""
+
+import inspect
+from fnmatch import fnmatch
+
+import lightning as L
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+import mambaloc
+from mambaloc.models import LitPoseRegressor
+from mambaloc.models.registry import model_class
+from mambaloc.nn import MambaMixer
+from mambaloc.types import PoseBatch, PosePrediction
+
+# What makes a system small and quick; each takes those arguments that it has.
+SMALL = {
+    "backbone": "mobilenetv3_small_050", "encoder_layers": 1, "dim": 32, "heads": 4, "feedforward": 32,
+    "head_hidden": 32,
+}  # fmt: skip
+SIDE = 64
+
+# Parameters that no loss can reach, and why.
+UNTRAINED = {
+    "none": (),
+    "classical": ("*.mixer.A_log",),  # from a zero state nothing decays
+    "gis": (),
+}
+
+CELLS = [(name, gis) for name in mambaloc.list_models() for gis in ("none", "classical", "gis")]
+EVERY = pytest.mark.parametrize(("name", "gis"), CELLS)
+EACH_ONCE = pytest.mark.parametrize("name", mambaloc.list_models())
+
+
+def small(name: str, gis: str, seed: int = 0, **kwargs) -> LitPoseRegressor:
+    taken = inspect.signature(model_class(name)).parameters
+    torch.manual_seed(seed)
+    return mambaloc.create_model(
+        name, gis=gis, image_size=SIDE, **{k: v for k, v in SMALL.items() if k in taken}, **kwargs
+    )
+
+
+def frames(count: int = 4, seed: int = 0) -> PoseBatch:
+    generator = torch.Generator().manual_seed(seed)
+    return PoseBatch(
+        torch.rand(count, 3, SIDE, SIDE, generator=generator),
+        torch.randn(count, 3, generator=generator),
+        torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1),
+        torch.arange(count),
+    )
+
+
+def flat(prediction: PosePrediction) -> Tensor:
+    return torch.cat((prediction.position_m, prediction.quaternion), dim=-1)
+
+
+@EVERY
+def test_shapes_and_finiteness(name, gis):
+    system = small(name, gis)
+    for train in (True, False):
+        prediction = system.train(train)(frames().image)
+        assert (prediction.position_m.shape, prediction.quaternion.shape) == ((4, 3), (4, 4))
+        assert flat(prediction).isfinite().all()
+
+
+@EVERY
+def test_every_parameter_is_trained(name, gis):
+    system, batch = small(name, gis).train(), frames()
+    system.loss(system(batch.image), batch).backward()
+    grads = {n: p.grad for n, p in system.named_parameters() if p.requires_grad}
+    assert all(grad.isfinite().all() for grad in grads.values() if grad is not None)
+    untrained = {n for n, grad in grads.items() if grad is None or not grad.any()}
+    assert untrained == {n for n in grads if any(fnmatch(n, pattern) for pattern in UNTRAINED[gis])}
+
+
+@EVERY
+@torch.no_grad()
+def test_evaluation_has_no_dropout_and_no_memory(name, gis):
+    system, image = small(name, gis), frames().image
+    dropout = any(isinstance(m, nn.Dropout) and m.p > 0 for m in system.modules())
+    assert not dropout or not torch.equal(flat(system.train()(image)), flat(system(image)))
+    system.eval()
+    before = {k: v.clone() for k, v in system.state_dict().items()}
+    first = flat(system(image))
+    assert torch.equal(first, flat(system(image)))
+    assert all(torch.equal(v, before[k]) for k, v in system.state_dict().items())
+    torch.testing.assert_close(first[1:2], flat(system(image[1:2])), rtol=1e-4, atol=1e-5)  # no frame sees another
+
+
+@EVERY
+@torch.no_grad()
+def test_a_seed_determines_the_system(name, gis):
+    first, again, other = (small(name, gis, seed=seed).eval() for seed in (3, 3, 4))
+    assert all(torch.equal(v, again.state_dict()[k]) for k, v in first.state_dict().items())
+    image = frames().image
+    assert torch.equal(flat(first(image)), flat(again(image)))
+    assert not torch.equal(flat(first(image)), flat(other(image)))
+
+
+@EVERY
+def test_checkpoint_round_trip(name, gis, tmp_path):
+    system, batch = small(name, gis, lr=1e-2), frames()
+    start = {k: v.clone() for k, v in system.named_parameters()}
+    trainer = L.Trainer(
+        default_root_dir=tmp_path, accelerator="cpu", max_epochs=1, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(system, DataLoader([batch], batch_size=None))
+    assert any(not torch.equal(p, start[n]) for n, p in system.named_parameters())
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+
+    system.eval()
+    for loaded in (mambaloc.load(tmp_path / "last.ckpt"), type(system).load_from_checkpoint(tmp_path / "last.ckpt")):
+        assert type(loaded) is type(system)
+        assert dict(loaded.hparams) == dict(system.hparams)
+        assert loaded.state_dict().keys() == system.state_dict().keys()
+        with torch.no_grad():
+            assert torch.equal(flat(loaded.eval()(batch.image)), flat(system(batch.image)))
+    assert loaded.provenance["model"] == name
+
+
+@EVERY
+def test_optimiser_holds_every_parameter_once_and_decays_neither_dynamics_nor_loss_weights(name, gis):
+    system = small(name, gis, weight_decay=0.25)
+    groups = system.configure_optimizers()["optimizer"].param_groups
+    held = [id(p) for group in groups for p in group["params"]]
+    assert sorted(held) == sorted(id(p) for p in system.parameters() if p.requires_grad)
+    assert {group["weight_decay"] for group in groups} == {0.25, 0.0}
+
+    undecayed = {id(p) for group in groups if group["weight_decay"] == 0 for p in group["params"]}
+    mixers = [m for m in system.modules() if isinstance(m, MambaMixer)]
+    assert bool(mixers) == (gis != "none")
+    expected = {id(p) for m in mixers for p in (m.A_log, m.D)} | {id(p) for p in system.loss.parameters()}
+    assert undecayed == expected
+
+
+@pytest.mark.slow
+@EACH_ONCE
+def test_eight_frames_can_be_learned_by_heart(name):
+    system, batch = small(name, "gis", lr=3e-3).train(), frames(8)
+    optimizer = system.configure_optimizers()["optimizer"]
+
+    def step() -> Tensor:
+        prediction = system(batch.image)
+        optimizer.zero_grad()
+        system.loss(prediction, batch).backward()
+        optimizer.step()
+        return (prediction.position_m.detach() - batch.position_m).norm(dim=-1).mean()
+
+    errors_m = torch.stack([step() for _ in range(60)])
+    assert errors_m[-5:].mean() < 0.4 * errors_m[0]
