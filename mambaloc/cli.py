@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import lightning as L
+import torch
 from jsonargparse import Namespace
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
@@ -108,7 +109,10 @@ class RecipeCLI(LightningCLI):
             raise
 
     def after_fit(self) -> None:
-        """Measure the best and the last epoch on the test split."""
+        """Measure the best and the last epoch on the test split, in one process."""
+        if torch.distributed.is_initialized():
+            torch.distributed.barrier()
+            torch.distributed.destroy_process_group()  # else the one would wait for all
         if self.trainer.fast_dev_run or not self.trainer.is_global_zero:  # type: ignore[attr-defined]
             return
         run_dir = Path(self.trainer.default_root_dir)

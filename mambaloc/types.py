@@ -66,7 +66,7 @@ def height_and_width(size: int | tuple[int, int]) -> tuple[int, int]:
     return (size, size) if isinstance(size, int) else (size[0], size[1])
 
 
-@dataclass(frozen=True)
+@dataclass  # not frozen, likewise
 class PosePrediction:
     """What a localiser says of a batch of images.
 

@@ -66,7 +66,7 @@ class WallClock(L.Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """End an epoch."""
         self._lap(pl_module, "train_s")
-        pl_module.log("time/train_s", self.seconds["train_s"], rank_zero_only=True)
+        pl_module.log("time/train_s", self.seconds["train_s"], sync_dist=True)
 
     def _lap(self, pl_module: L.LightningModule, name: str | None) -> None:
         if pl_module.device.type == "cuda":

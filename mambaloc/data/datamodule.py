@@ -229,7 +229,7 @@ class PoseDataModule(L.LightningDataModule):
             sampler.set_epoch(trainer.fit_loop.epoch_progress.current.processed)  # type: ignore[attr-defined]
         return DataLoader(
             data,
-            batch_size,
+            batch_size=batch_size,  # by name: Lightning makes this loader again to predict
             sampler=sampler,
             num_workers=self.hparams["num_workers"],
             collate_fn=_as_fetched,  # type: ignore[arg-type]

@@ -86,7 +86,7 @@ class LitPoseRegressor(L.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         """Log the learning rate."""
-        self.log("train/lr", self.optimizers().param_groups[0]["lr"])  # type: ignore[union-attr]
+        self.log("train/lr", self.optimizers().param_groups[0]["lr"], sync_dist=True)  # type: ignore[union-attr]
 
     def on_train_batch_start(self, batch: PoseBatch, batch_idx: int) -> None:
         """Tie dropout to (seed, step, rank), so that a resumed run continues exactly."""
@@ -102,7 +102,7 @@ class LitPoseRegressor(L.LightningModule):
     def on_train_epoch_end(self) -> None:
         """Log the learned loss weights."""
         for name, parameter in self.loss.named_parameters():
-            self.log(f"train/{name}", parameter.detach())
+            self.log(f"train/{name}", parameter.detach(), sync_dist=True)
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:
         """Collect a validation batch."""
@@ -128,7 +128,7 @@ class LitPoseRegressor(L.LightningModule):
 
     def _log_errors(self, split: str, errors: PoseErrors) -> None:
         for name, value in errors.compute().items():
-            self.log(f"{split}/{name}", value, rank_zero_only=False)
+            self.log(f"{split}/{name}", value, sync_dist=True)
 
     def on_validation_epoch_start(self) -> None:
         """Forget the previous validation."""

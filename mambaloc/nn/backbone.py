@@ -108,10 +108,11 @@ def _stages_at(name: str, strides: tuple[int, ...]) -> list[int]:
     try:
         with torch.device("meta"):
             model: Any = timm.create_model(name, features_only=True, feature_cls="getter")
-        reductions = model.feature_info.reduction()
+        info = model.feature_info
+        reductions: dict[int, int] = dict(zip(info.out_indices, info.reduction(), strict=True))
     except (RuntimeError, AttributeError, NotImplementedError) as error:
         raise InputError(f"backbone {name!r}: timm offers no feature maps of it ({error})") from None
-    lacking = [stride for stride in strides if stride not in reductions]
-    if lacking:
-        raise InputError(f"backbone {name!r}: needs feature maps at strides {strides}, has {sorted(set(reductions))}")
-    return [max(i for i, reduction in enumerate(reductions) if reduction == stride) for stride in strides]
+    offered = sorted(set(reductions.values()))
+    if not set(strides) <= set(offered):
+        raise InputError(f"backbone {name!r}: needs feature maps at strides {strides}, has {offered}")
+    return [max(stage for stage, reduction in reductions.items() if reduction == stride) for stride in strides]
