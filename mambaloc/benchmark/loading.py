@@ -77,7 +77,7 @@ def _cached(data: PoseDataModule) -> Callable[[list[int]], Tensor]:
     def load(indices: list[int]) -> Tensor:
         batch = frames.__getitems__(indices)  # type: ignore[attr-defined]
         how = draw_augmentations(batch.image, data.crop, data.jitter, 0, 0, batch.index)
-        return (augment(batch.image, how, data.crop) - mean) / std
+        return augment(batch.image, how, data.crop).sub_(mean).div_(std)
 
     return load
 

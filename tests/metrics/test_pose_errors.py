@@ -178,7 +178,7 @@ def in_one_process(rank: int, folder: Path) -> None:
         init_method=f"file://{folder}/rendezvous",
         rank=rank,
         world_size=len(SHARDS),
-        timeout=timedelta(minutes=1),  # processes that gather different things wait for one another
+        timeout=timedelta(minutes=5),  # processes that gather different things wait for one another
     )
     metric, (prediction, target) = PoseErrors(), frames(10)
     for index in SHARDS[rank]:
