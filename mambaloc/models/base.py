@@ -203,7 +203,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise InputError(f"{path}: refused, since loading it could run code ({reason}); use a trusted export") from None
     except Exception as error:  # torch's unpickler fails on broken files with KeyError, IndexError, struct.error, ...
         raise InputError(f"{path}: not a readable checkpoint ({type(error).__name__}); is it complete?") from None
-    if not isinstance(checkpoint, dict) or "mambaloc" not in checkpoint:
+    ours = checkpoint.get("mambaloc") if isinstance(checkpoint, dict) else None
+    if not isinstance(ours, dict) or "model" not in ours:
         raise InputError(f"{path}: not a MambaLoc checkpoint; give one that a training run wrote")
     return checkpoint
 

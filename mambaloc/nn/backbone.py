@@ -61,6 +61,8 @@ class Backbone(nn.Module):
         except TypeError as error:
             raise InputError(f"backbone_args {timm_args}: {name} does not take them ({error})") from None
         except (OSError, RuntimeError) as error:
+            if weights != "timm":
+                raise InputError(f"backbone {name!r}: timm cannot build it with {timm_args} ({error})") from error
             raise InputError(
                 f"backbone_weights: timm's weights of {name} could not be fetched ({type(error).__name__}); "
                 "name a local .safetensors file instead, or null to start from scratch"
@@ -80,9 +82,12 @@ class Backbone(nn.Module):
     def grids(self, image_size: tuple[int, int]) -> list[tuple[int, int]]:
         """Rows and columns of each feature map for an image of ``(height, width)``, found by running one."""
         training = self.training
-        shapes = [tuple(feats.shape[-2:]) for feats in self.eval()(torch.zeros(1, 3, *image_size))]
-        self.train(training)
-        return shapes
+        try:
+            return [tuple(feats.shape[-2:]) for feats in self.eval()(torch.zeros(1, 3, *image_size))]
+        except (RuntimeError, AssertionError, ValueError) as error:
+            raise InputError(f"image_size {image_size}: backbone {self.name!r} does not take it ({error})") from None
+        finally:
+            self.train(training)
 
     def _load(self, path: Path) -> None:
         if path.suffix != ".safetensors":
