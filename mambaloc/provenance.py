@@ -1,7 +1,8 @@
-"""Where a number comes from: commit, versions, device."""
+"""Where a number comes from: commit, seed, versions, device."""
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
@@ -20,6 +21,11 @@ def commit() -> str | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     return f"{head}+changes" if changes else head
+
+
+def seed() -> int:
+    """Return the run's seed, as ``lightning.seed_everything`` leaves it for every process; 0 where nobody set one."""
+    return int(os.environ.get("PL_GLOBAL_SEED", "0"))
 
 
 def versions() -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
+from mambaloc import provenance
 from mambaloc.data.augmentation import Jitter, augment, center_crop, draw_augmentations
 from mambaloc.data.cache import cached_frames
 from mambaloc.data.datasets import DATASETS, is_official, scene_folder
@@ -179,7 +179,7 @@ class PoseDataModule(L.LightningDataModule):
         """Crop and normalise on the device; jitter while training."""
         if self.trainer is None or not self.trainer.training:
             return replace(batch, image=center_crop(batch.image, self.crop))
-        seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
+        seed = provenance.seed()
         how = draw_augmentations(batch.image, self.crop, self.jitter, seed, self.trainer.current_epoch, batch.index)
         return replace(batch, image=augment(batch.image, how, self.crop))
 
@@ -222,7 +222,7 @@ class PoseDataModule(L.LightningDataModule):
             num_replicas=trainer.world_size if trainer else 1,
             rank=trainer.global_rank if trainer else 0,
             shuffle=shuffle,
-            seed=int(os.environ.get("PL_GLOBAL_SEED", "0")),
+            seed=provenance.seed(),
         )
         if trainer and shuffle:
             # A resumed fit fetches its first batch before Lightning tells the sampler which epoch it is.

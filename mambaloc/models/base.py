@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import os
 import pickle
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -90,8 +89,7 @@ class LitPoseRegressor(L.LightningModule):
 
     def on_train_batch_start(self, batch: PoseBatch, batch_idx: int) -> None:
         """Tie dropout to (seed, step, rank), so that a resumed run continues exactly."""
-        seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
-        torch.manual_seed(hash((seed, self.current_epoch, batch_idx, self.global_rank)))
+        torch.manual_seed(hash((provenance.seed(), self.current_epoch, batch_idx, self.global_rank)))
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
@@ -163,7 +161,7 @@ class LitPoseRegressor(L.LightningModule):
             "commit": provenance.commit(),
             "versions": provenance.versions(),
             "device": provenance.device_name(self.device.index if self.device.type == "cuda" else None),
-            "seed": int(os.environ.get("PL_GLOBAL_SEED", "0")),
+            "seed": provenance.seed(),
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
