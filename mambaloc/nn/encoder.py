@@ -72,13 +72,20 @@ class EncoderLayer(nn.Module):
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
 
-    def forward(self, tokens_BND: Tensor, positions_ND: Tensor) -> Tensor:
-        """Attend, then transform each token; both around a residual."""
-        tokens_BND = tokens_BND + self.dropout(self._attend(self.norm_attention(tokens_BND), positions_ND))
+    def forward(self, tokens_BND: Tensor, positions_ND: Tensor, keep: int | None = None) -> Tensor:
+        """Attend, then transform each token; both around a residual.
+
+        With ``keep`` only so many first tokens are computed, (B, keep, D): all attend, and are attended to, as before.
+        """
+        attended_BND = self._attend(self.norm_attention(tokens_BND), positions_ND, keep)
+        tokens_BND = tokens_BND[:, :keep] + self.dropout(attended_BND)
         return tokens_BND + self.dropout(self.mlp(self.norm_mlp(tokens_BND)))
 
-    def _attend(self, tokens_BND: Tensor, positions_ND: Tensor) -> Tensor:
-        query_BND, key_BND = self.qk(tokens_BND + positions_ND).chunk(2, dim=-1)
+    def _attend(self, tokens_BND: Tensor, positions_ND: Tensor, keep: int | None) -> Tensor:
+        placed_BND = tokens_BND + positions_ND
+        (query_weight, key_weight), (query_bias, key_bias) = self.qk.weight.chunk(2), self.qk.bias.chunk(2)
+        query_BND = F.linear(placed_BND[:, :keep], query_weight, query_bias)
+        key_BND = F.linear(placed_BND, key_weight, key_bias)
         q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (query_BND, key_BND, self.v(tokens_BND)))
         dropout = self.attention_dropout if self.training else 0.0
         attended = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout)
@@ -127,6 +134,7 @@ class TokenEncoder(nn.Module):
         cells_BND = self.project(feats_BCHW).flatten(2).mT
         tokens_BND = torch.cat((self.token.expand(cells_BND.shape[0], -1, -1), cells_BND), dim=1)
         positions_ND = self.positions()
-        for layer in self.layers:
+        *layers, last = self.layers
+        for layer in layers:
             tokens_BND = layer(tokens_BND, positions_ND)
-        return self.norm(tokens_BND[:, 0])
+        return self.norm(last(tokens_BND, positions_ND, keep=1)[:, 0])  # only the token is read
