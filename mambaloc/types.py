@@ -24,7 +24,7 @@ Shape suffixes
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from torch import Tensor
 
@@ -49,16 +49,23 @@ class PoseBatch:
         ``image`` (B, 3, H, W): ``uint8`` as loaded, ``float32`` in 0..1 once on the device and augmented.
         ``position_m`` (B, 3) and ``quaternion`` (B, 4): the true ``world_from_cam``.
         ``index`` (B,): the frame's row in its split, which names it in every report.
+        ``clip_length``: so many successive rows are frames of one sequence, in time order; B is a multiple of it.
+        ``points_m`` (B, P, 3): scene points that each frame may see, world frame, NaN where it has fewer than P.
+        ``intrinsics`` (B, 3, 3): pinhole matrices in pixels of ``image``, given with ``points_m``.
     """
 
     image: Tensor
     position_m: Tensor
     quaternion: Tensor
     index: Tensor
+    clip_length: int = 1
+    points_m: Tensor | None = None
+    intrinsics: Tensor | None = None
 
     def pin_memory(self) -> PoseBatch:
         """Copy to page-locked memory; the DataLoader calls it where ``pin_memory=True``."""
-        return PoseBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
+        tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        return replace(self, **{name: tensor.pin_memory() for name, tensor in tensors.items()})
 
 
 def height_and_width(size: int | tuple[int, int]) -> tuple[int, int]:
@@ -73,7 +80,11 @@ class PosePrediction:
     Shape:
         ``position_m`` (B, 3) in metres. ``quaternion`` (B, 4) as the network regressed it: the loss and the
         metrics normalise it, ``mambaloc.geometry.canonical`` makes it a unit quaternion with ``w >= 0``.
+        ``log_quaternion`` (B, 3): what a system that regresses it said; ``quaternion`` is its exponential.
+        ``auxiliary``: what auxiliary heads say while training.
     """
 
     position_m: Tensor
     quaternion: Tensor
+    log_quaternion: Tensor | None = None
+    auxiliary: tuple[PosePrediction, ...] = ()

@@ -1,5 +1,6 @@
-"""Rotations and poses: torch only, conventions as in ``mambaloc.types``."""
+"""Rotations, poses and cameras: torch only, conventions as in ``mambaloc.types``."""
 
+from mambaloc.geometry.cameras import cropped_intrinsics, project, resized_intrinsics
 from mambaloc.geometry.poses import (
     compose,
     inverse,
@@ -12,9 +13,11 @@ from mambaloc.geometry.rotations import (
     canonical,
     conjugate,
     is_rotation,
+    log_from_quaternion,
     matrix_from_quaternion,
     multiply,
     normalize,
+    quaternion_from_log,
     quaternion_from_matrix,
     rotate,
     rotation_error_deg,
@@ -24,15 +27,20 @@ __all__ = [
     "canonical",
     "compose",
     "conjugate",
+    "cropped_intrinsics",
     "inverse",
     "is_rotation",
+    "log_from_quaternion",
     "matrix_from_pose",
     "matrix_from_quaternion",
     "multiply",
     "normalize",
     "pose_from_matrix",
     "position_error_m",
+    "project",
+    "quaternion_from_log",
     "quaternion_from_matrix",
+    "resized_intrinsics",
     "rotate",
     "rotation_error_deg",
     "transform",

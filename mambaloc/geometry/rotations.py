@@ -121,6 +121,28 @@ def quaternion_from_matrix(matrix: Tensor) -> Tensor:
     return canonical(rows.gather(-2, largest.expand_as(rows[..., :1, :])).squeeze(-2))
 
 
+def log_from_quaternion(quaternion: Tensor) -> Tensor:
+    """Logarithm of the canonical quaternion: the axis times half the angle (MapNet, Brahmbhatt et al. 2018).
+
+    Shape:
+        (..., 4), of any length and sign -> (..., 3), of norm 0..pi/2.
+    """
+    w, xyz = canonical(quaternion).split((1, 3), dim=-1)
+    sine = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
+    is_small = sine < torch.finfo(sine.dtype).eps  # there angle / sine is 1 to the last digit
+    return xyz * torch.where(is_small, 1.0, torch.atan2(sine, w) / sine.masked_fill(is_small, 1.0))
+
+
+def quaternion_from_log(log_quaternion: Tensor) -> Tensor:
+    """Exponential of an axis times half an angle: the inverse of :func:`log_from_quaternion` up to the sign.
+
+    Shape:
+        (..., 3), of any norm -> (..., 4), unit; ``w < 0`` where the norm passes pi/2.
+    """
+    half_angle = torch.linalg.vector_norm(log_quaternion, dim=-1, keepdim=True)
+    return torch.cat((half_angle.cos(), torch.sinc(half_angle / math.pi) * log_quaternion), dim=-1)
+
+
 def rotation_error_deg(a: Tensor, b: Tensor) -> Tensor:
     """Angle of the rotation between ``a`` and ``b``, quaternions of any length and sign, in 0..180 degrees.
 
