@@ -18,7 +18,7 @@ from mambaloc.data.augmentation import Jitter, augment, center_crop, draw_augmen
 from mambaloc.data.cache import cached_frames
 from mambaloc.data.datasets import DATASETS, is_official, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
-from mambaloc.data.splits import Validation, hold_out, subsample
+from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
 from mambaloc.errors import InputError
 from mambaloc.types import PoseBatch, height_and_width
 
@@ -26,21 +26,29 @@ Part = Literal["train", "val", "test"]
 
 
 class CachedFrames(Dataset[PoseBatch]):
-    """Frames of one part of a scene, already decoded; fetched a batch at a time."""
+    """Frames of one part of a scene, already decoded; fetched a batch at a time.
 
-    def __init__(self, frames: Frames, images: NDArray[np.uint8]) -> None:
+    Args:
+        frames: the frames.
+        images: what each looks like, (N, 3, H, W).
+        clips: the frames of each item, (C, length); each frame by itself unless given.
+    """
+
+    def __init__(self, frames: Frames, images: NDArray[np.uint8], clips: NDArray[np.int64] | None = None) -> None:
         self.frames, self.images = frames, images
+        self.clips = np.arange(len(frames))[:, None] if clips is None else clips
         self.position_m = torch.from_numpy(frames.position_m).float()
         self.quaternion = torch.from_numpy(frames.quaternion).float()
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self.clips)
 
-    def __getitems__(self, indices: list[int]) -> PoseBatch:
-        """Fetch a batch: ``image`` (B, 3, H, W) uint8 as cached, uncropped."""
-        index = torch.tensor(indices)
-        images = torch.from_numpy(np.stack([self.images[i] for i in indices]))
-        return PoseBatch(images, self.position_m[index], self.quaternion[index], index)
+    def __getitems__(self, items: list[int]) -> PoseBatch:
+        """Fetch a batch of items, clip after clip: ``image`` (B, 3, H, W) uint8 as cached, uncropped."""
+        rows = self.clips[items].ravel()
+        index = torch.from_numpy(rows)
+        images = torch.from_numpy(np.stack([self.images[row] for row in rows]))
+        return PoseBatch(images, self.position_m[index], self.quaternion[index], index, self.clips.shape[1])
 
 
 @dataclass(frozen=True)
@@ -60,7 +68,7 @@ class PoseDataModule(L.LightningDataModule):
         scene: folder of the scene under ``root``.
         image_size: side of the square crop, or (height, width), in pixels.
         short_side: what the shorter side of every image is resized to, in pixels.
-        batch_size: training images a step, per device.
+        batch_size: training images, or clips, a step, per device.
         eval_batch_size: images a step of validation and test.
         num_workers: loader processes; frames come from a memory map, so none is often fastest.
         brightness: range of that jitter factor, ``[1 - x, 1 + x]``.
@@ -72,6 +80,8 @@ class PoseDataModule(L.LightningDataModule):
         val_sequences: sequences to hold out, by name.
         keep_every: train on every k-th frame of each sequence (sparsity 1/k).
         keep_count: train on so many frames, uniform in time, instead.
+        clip_length: train on clips of so many frames of a sequence, as MapNet does.
+        clip_skip: frames from one of a clip to the next, counted before thinning.
         on_bad_frame: ``error`` stops at a bad frame; ``skip`` leaves it out and counts it.
         cache_dir: where decoded frames are kept; ``$MAMBALOC_CACHE`` or the user's cache folder unless given.
     """
@@ -95,6 +105,8 @@ class PoseDataModule(L.LightningDataModule):
         val_sequences: list[str] | None = None,
         keep_every: int = 1,
         keep_count: int | None = None,
+        clip_length: int = 1,
+        clip_skip: int = 10,
         on_bad_frame: OnBadFrame = "error",
         cache_dir: str | None = None,
     ) -> None:
@@ -149,12 +161,14 @@ class PoseDataModule(L.LightningDataModule):
             "scene": self.folder.name,
             "official_split": is_official(hparams["dataset"], hparams["scene"], self._listed),
             "listed_frames": dict(self._listed),
-            **{f"{part}_frames": len(loaded.data) for part, loaded in self._loaded.items()},
+            **{f"{part}_frames": len(loaded.data.frames) for part, loaded in self._loaded.items()},
             "skipped": {part: loaded.bad.counts() for part, loaded in self._loaded.items()},
             "repaired": {part: len(loaded.bad.repaired) for part, loaded in self._loaded.items()},
             "validation": hparams["validation"],
             "keep_every": hparams["keep_every"],
             "keep_count": hparams["keep_count"],
+            "clip_length": hparams["clip_length"],
+            "clip_skip": hparams["clip_skip"],
             "image_size": list(self.crop),
             "short_side": hparams["short_side"],
         }
@@ -212,7 +226,12 @@ class PoseDataModule(L.LightningDataModule):
             train = frames.select(train_rows)
             self._loaded["val"] = self._decode(frames.select(val_rows), BadFrames(bad.policy))
         kept = subsample(train, self.hparams["keep_every"], self.hparams["keep_count"])
-        self._loaded["train"] = self._decode(train.select(kept), bad)
+        loaded = self._decode(train.select(kept), bad)
+        if (length := self.hparams["clip_length"]) != 1:
+            skip = max(1, round(self.hparams["clip_skip"] * len(kept) / len(train)))
+            clips = clips_of(loaded.data.frames, length, skip)
+            loaded = replace(loaded, data=CachedFrames(loaded.data.frames, loaded.data.images, clips))
+        self._loaded["train"] = loaded
 
     def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._loaded[part].data, self.trainer

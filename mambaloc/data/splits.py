@@ -1,4 +1,4 @@
-"""Hold out a validation set honestly, and thin a training set.
+"""Hold out a validation set honestly, thin a training set, and cut it into clips.
 
 Neighbouring frames are about 1 cm and 0.5 degrees apart, so a random split would leak.
 """
@@ -109,3 +109,48 @@ def subsample(frames: Frames, keep_every: int = 1, keep_count: int | None = None
     if keep_every < 1:
         raise InputError(f"data.keep_every {keep_every}: must be 1 or more")
     return np.concatenate([indices[::keep_every] for indices in frames.by_sequence().values()])
+
+
+def clips_of(frames: Frames, length: int, skip: int) -> NDArray[np.int64]:
+    """Choose a clip around each frame, of its own sequence: MapNet's tuples, which never cross a border.
+
+    The frame is the clip's middle where that fits, else an earlier or later one; where nothing fits, the frames lie
+    closer together. Frames of a sequence that is shorter than a clip have none.
+
+    Args:
+        frames: the training frames.
+        length: frames of a clip.
+        skip: frames from one to the next.
+
+    Returns:
+        Indices in time order, (C, length).
+
+    Raises:
+        InputError: where a number is out of range or no sequence is long enough.
+    """
+    if length < 2 or skip < 1:
+        raise InputError(
+            f"data.clip_length {length} and clip_skip {skip}: a clip has 2 frames or more, 1 or more apart"
+        )
+    by_sequence = frames.by_sequence()
+    clips = [
+        indices[_clip_around(place, len(indices), length, skip)]
+        for indices in by_sequence.values()
+        if len(indices) >= length
+        for place in range(len(indices))
+    ]
+    if not clips:
+        longest = max(len(indices) for indices in by_sequence.values())
+        raise InputError(
+            f"data.clip_length {length}: the longest of {len(by_sequence)} training sequences has {longest} frames; "
+            "clips need video, so choose a shorter clip, or a scene whose frames were taken in sequence"
+        )
+    return np.stack(clips)
+
+
+def _clip_around(place: int, count: int, length: int, skip: int) -> NDArray[np.int64]:
+    """Places of a clip that holds ``place`` within ``count`` frames."""
+    slots = sorted(range(length), key=lambda slot: abs(slot - length // 2))
+    starts = ((place - slot * step, step) for step in range(skip, 0, -1) for slot in slots)
+    start, step = next((a, step) for a, step in starts if a >= 0 and a + (length - 1) * step < count)
+    return start + step * np.arange(length)

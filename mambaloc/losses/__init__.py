@@ -7,9 +7,17 @@ from typing import Any
 from torch import nn
 
 from mambaloc.errors import InputError
+from mambaloc.losses.log_quaternion import LogQuaternionWeights, RelativeLogQuaternionWeights
+from mambaloc.losses.reprojection import Reprojection
 from mambaloc.losses.weighted import FixedWeights, LearnedWeights
 
-LOSSES: dict[str, type[nn.Module]] = {"learned_weights": LearnedWeights, "fixed_weights": FixedWeights}
+LOSSES: dict[str, type[nn.Module]] = {
+    "learned_weights": LearnedWeights,
+    "fixed_weights": FixedWeights,
+    "log_quaternion": LogQuaternionWeights,
+    "relative_log_quaternion": RelativeLogQuaternionWeights,
+    "reprojection": Reprojection,
+}
 
 
 def build_loss(name: str, args: dict[str, Any] | None = None) -> nn.Module:
@@ -26,4 +34,12 @@ def build_loss(name: str, args: dict[str, Any] | None = None) -> nn.Module:
         raise InputError(f"loss_args {args}: {name} does not take them ({error})") from None
 
 
-__all__ = ["LOSSES", "FixedWeights", "LearnedWeights", "build_loss"]
+__all__ = [
+    "LOSSES",
+    "FixedWeights",
+    "LearnedWeights",
+    "LogQuaternionWeights",
+    "RelativeLogQuaternionWeights",
+    "Reprojection",
+    "build_loss",
+]

@@ -17,7 +17,7 @@ from mambaloc import provenance
 from mambaloc.errors import InputError
 from mambaloc.losses import build_loss
 from mambaloc.metrics import PoseErrors
-from mambaloc.nn.heads import PositionScale
+from mambaloc.nn import Discretisation, GISMode, PositionScale
 from mambaloc.types import PoseBatch, PosePrediction, height_and_width
 
 
@@ -30,6 +30,14 @@ class LitPoseRegressor(L.LightningModule):
 
     Args:
         image_size: side of the square crop, or (height, width), in pixels; recipes set it once, in ``data``.
+        backbone: a timm model.
+        backbone_weights: ``timm`` downloads timm's own; otherwise a ``.safetensors`` file; None starts from scratch.
+        backbone_args: passed on to timm, for instance ``{"pad_type": "same"}``.
+        pixel_mean: RGB mean that the backbone expects, in 0..1; timm's for it unless given.
+        pixel_std: RGB deviation, likewise.
+        gis: the Global Information Selector of each branch: ``gis``, its ablation ``classical``, or ``none``.
+        discretisation: of GIS's state space: ``euler`` or ``zoh``.
+        warm_start: checkpoint of a like network, whose weights the training starts from.
         loss: name in ``mambaloc.losses.LOSSES``.
         loss_args: that loss's arguments.
         lr: learning rate of Adam.
@@ -45,6 +53,14 @@ class LitPoseRegressor(L.LightningModule):
     def __init__(
         self,
         image_size: int | tuple[int, int] = 224,
+        backbone: str = "resnet34",
+        backbone_weights: str | None = None,
+        backbone_args: dict[str, Any] | None = None,
+        pixel_mean: tuple[float, float, float] | None = None,
+        pixel_std: tuple[float, float, float] | None = None,
+        gis: GISMode = "none",
+        discretisation: Discretisation = "euler",
+        warm_start: str | None = None,
         loss: str = "learned_weights",
         loss_args: dict[str, Any] | None = None,
         lr: float = 1e-4,
@@ -62,14 +78,23 @@ class LitPoseRegressor(L.LightningModule):
         self.provenance: dict[str, Any] = {}
         self.save_hyperparameters()
         self.network = self.configure_network()
+        if warm_start is not None:
+            start_from(self.network, warm_start)
 
     def configure_network(self) -> nn.Module:
         """Build the network from the hyperparameters: images in, :class:`~mambaloc.types.PosePrediction` out."""
         raise TypeError(f"{type(self).__name__} defines no configure_network()")
 
+    @property
+    def backbone_arguments(self) -> dict[str, Any]:
+        """What the hyperparameters say of the backbone, as ``mambaloc.nn``'s backbones take it."""
+        names = ("backbone", "backbone_weights", "backbone_args", "pixel_mean", "pixel_std")
+        taken_as = ("name", "weights", "timm_args", "pixel_mean", "pixel_std")
+        return {theirs: self.hparams[ours] for theirs, ours in zip(taken_as, names, strict=True)}
+
     def hyperparameters_of(self, network: type[nn.Module]) -> dict[str, Any]:
-        """Those of this system's hyperparameters that a network class takes, but for the image size."""
-        taken = set(inspect.signature(network).parameters) - {"image_size"}
+        """Those of this system's hyperparameters that a network class takes, beside its backbone and image size."""
+        taken = set(inspect.signature(network).parameters) - {"backbone", "image_size"}
         return {name: value for name, value in self.hparams.items() if name in taken}
 
     def forward(self, image: Tensor) -> PosePrediction:
@@ -92,8 +117,11 @@ class LitPoseRegressor(L.LightningModule):
         torch.manual_seed(hash((provenance.seed(), self.current_epoch, batch_idx, self.global_rank)))
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
-        """Return the loss of a batch."""
-        loss = self.loss(self(batch.image), batch)
+        """Return the loss of a batch; auxiliary heads weigh 0.3 each (Szegedy et al. 2015)."""
+        prediction = self(batch.image)
+        loss = self.loss(prediction, batch)
+        for auxiliary in prediction.auxiliary:
+            loss = loss + 0.3 * self.loss(auxiliary, batch)
         self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch.index), sync_dist=True)
         return loss
 
@@ -180,8 +208,9 @@ class LitPoseRegressor(L.LightningModule):
             InputError: where the file is missing, is no such checkpoint or holds anything but plain data.
         """
         checkpoint = read_checkpoint(checkpoint_path)  # refuse with a clear line first
-        if "backbone_weights" in checkpoint.get("hyper_parameters", {}):  # a system may have no such argument
-            kwargs.setdefault("backbone_weights", None)
+        for start in ("backbone_weights", "warm_start"):
+            if start in checkpoint.get("hyper_parameters", {}):  # a system may have no such argument
+                kwargs.setdefault(start, None)
         kwargs["weights_only"] = True
         return super().load_from_checkpoint(checkpoint_path, map_location=map_location, **kwargs)
 
@@ -205,6 +234,23 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not isinstance(ours, dict) or "model" not in ours:
         raise InputError(f"{path}: not a MambaLoc checkpoint; give one that a training run wrote")
     return checkpoint
+
+
+def start_from(network: nn.Module, path: str | Path) -> None:
+    """Copy the weights of a checkpoint's network.
+
+    Raises:
+        InputError: where there is no such checkpoint, or its network is another one.
+    """
+    prefix = "network."
+    state = read_checkpoint(path)["state_dict"]
+    try:
+        network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise InputError(
+            f"warm_start {path}: its network is another one ({reason}); train that with this recipe's model arguments"
+        ) from None
 
 
 def parameter_mib(network: nn.Module) -> float:

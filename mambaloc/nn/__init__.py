@@ -1,9 +1,9 @@
-"""Blocks that know no pose, no batch and no file."""
+"""Blocks that know no batch and no file."""
 
-from mambaloc.nn.backbone import Backbone
+from mambaloc.nn.backbone import Backbone, ImageBackbone, PooledBackbone
 from mambaloc.nn.encoder import TokenEncoder
 from mambaloc.nn.gis import GISMode, GlobalInformationSelector, build_gis
-from mambaloc.nn.heads import PositionScale, RegressionHead
+from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation
 from mambaloc.nn.ssm import Discretisation, MambaMixer, selective_scan
 
 __all__ = [
@@ -11,9 +11,13 @@ __all__ = [
     "Discretisation",
     "GISMode",
     "GlobalInformationSelector",
+    "ImageBackbone",
     "MambaMixer",
+    "PooledBackbone",
+    "PoseHead",
     "PositionScale",
     "RegressionHead",
+    "Rotation",
     "TokenEncoder",
     "build_gis",
     "selective_scan",

@@ -1,4 +1,4 @@
-"""Convolutional backbones from timm, cut after the last feature map that is used."""
+"""Backbones from timm, cut after what is used of them: feature maps, or one pooled feature."""
 
 from __future__ import annotations
 
@@ -15,7 +15,64 @@ from torch import Tensor, nn
 from mambaloc.errors import InputError
 
 
-class Backbone(nn.Module):
+class ImageBackbone(nn.Module):
+    """Base of backbones: a body that sees normalised images, and the weights it starts from.
+
+    Args:
+        name: what messages call the body.
+        body: the module.
+        weights: a ``.safetensors`` file, or None.
+        pixel_mean: RGB mean in 0..1 that the body expects.
+        pixel_std: RGB deviation in 0..1, likewise.
+
+    Raises:
+        InputError: for weights that are not there or do not fit.
+    """
+
+    body: Any
+    pixel_mean: Tensor
+    pixel_std: Tensor
+
+    def __init__(
+        self,
+        name: str,
+        body: nn.Module,
+        weights: str | None,
+        pixel_mean: tuple[float, float, float],
+        pixel_std: tuple[float, float, float],
+    ) -> None:
+        super().__init__()
+        self.name, self.body = name, body
+        if weights is not None:
+            self._load(Path(weights))
+        self.register_buffer("pixel_mean", torch.tensor(pixel_mean).view(3, 1, 1))
+        self.register_buffer("pixel_std", torch.tensor(pixel_std).view(3, 1, 1))
+        self.to(memory_format=torch.channels_last)  # what fast convolution kernels read, on CPU and GPU
+
+    @property
+    def model(self) -> Any:
+        """The module whose weights a file holds."""
+        return self.body
+
+    def normalised(self, image: Tensor) -> Tensor:
+        """What the body sees of an image in 0..1."""
+        return ((image - self.pixel_mean) / self.pixel_std).contiguous(memory_format=torch.channels_last)
+
+    def _load(self, path: Path) -> None:
+        if path.suffix != ".safetensors":
+            raise InputError(f"backbone_weights {path}: only .safetensors files are read; convert it, or use 'timm'")
+        try:
+            missing, _ = self.model.load_state_dict(load_file(path), strict=False)
+        except FileNotFoundError:
+            raise InputError(f"backbone_weights {path}: no such file; name one, 'timm', or null") from None
+        except (SafetensorError, RuntimeError, OSError) as error:
+            reason = str(error).splitlines()[-1].strip()  # load_state_dict's first line names no tensor
+            raise InputError(f"backbone_weights {path}: does not fit {self.name} ({reason})") from None
+        if missing:
+            raise InputError(f"backbone_weights {path}: lacks {len(missing)} tensors of {self.name}, as {missing[0]}")
+
+
+class Backbone(ImageBackbone):
     """Feature maps of a timm model at given strides; stages past the last one do not exist.
 
     Args:
@@ -33,10 +90,6 @@ class Backbone(nn.Module):
         InputError: for an unknown model, strides that it does not have, or weights that do not fit.
     """
 
-    body: Any
-    pixel_mean: Tensor
-    pixel_std: Tensor
-
     def __init__(
         self,
         name: str,
@@ -46,39 +99,22 @@ class Backbone(nn.Module):
         pixel_mean: tuple[float, float, float] | None = None,
         pixel_std: tuple[float, float, float] | None = None,
     ) -> None:
-        super().__init__()
-        self.name, self.strides = name, strides
-        stages = _stages_at(name, strides)
-        try:
-            self.body = timm.create_model(
-                name,
-                pretrained=weights == "timm",
-                features_only=True,
-                feature_cls="getter",
-                out_indices=stages,
-                **(timm_args or {}),
-            )
-        except TypeError as error:
-            raise InputError(f"backbone_args {timm_args}: {name} does not take them ({error})") from None
-        except (OSError, RuntimeError) as error:
-            if weights != "timm":
-                raise InputError(f"backbone {name!r}: timm cannot build it with {timm_args} ({error})") from error
-            raise InputError(
-                f"backbone_weights: timm's weights of {name} could not be fetched ({type(error).__name__}); "
-                "name a local .safetensors file instead, or null to start from scratch"
-            ) from error
-        if weights not in (None, "timm"):
-            self._load(Path(weights))
+        cut = {"features_only": True, "feature_cls": "getter", "out_indices": _stages_at(name, strides)}
+        body = _timm_model(name, weights, timm_args, **cut)
+        config = body.model.pretrained_cfg
+        file = None if weights == "timm" else weights
+        super().__init__(name, body, file, pixel_mean or config["mean"], pixel_std or config["std"])
+        self.strides = strides
         self.channels: list[int] = self.body.feature_info.channels()
-        config = self.body.model.pretrained_cfg
-        self.register_buffer("pixel_mean", torch.tensor(pixel_mean or config["mean"]).view(3, 1, 1))
-        self.register_buffer("pixel_std", torch.tensor(pixel_std or config["std"]).view(3, 1, 1))
-        self.to(memory_format=torch.channels_last)  # what fast convolution kernels read, on CPU and GPU
+
+    @property
+    def model(self) -> Any:
+        """The module whose weights a file holds."""
+        return self.body.model
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """Normalise the image and return its feature maps, finest first."""
-        image = (image - self.pixel_mean) / self.pixel_std
-        return self.body(image.contiguous(memory_format=torch.channels_last))
+        return self.body(self.normalised(image))
 
     @torch.no_grad()
     def grids(self, image_size: tuple[int, int]) -> list[tuple[int, int]]:
@@ -91,27 +127,65 @@ class Backbone(nn.Module):
         finally:
             self.train(training)
 
-    def _load(self, path: Path) -> None:
-        if path.suffix != ".safetensors":
-            raise InputError(f"backbone_weights {path}: only .safetensors files are read; convert it, or use 'timm'")
-        try:
-            missing, _ = self.body.model.load_state_dict(load_file(path), strict=False)
-        except FileNotFoundError:
-            raise InputError(f"backbone_weights {path}: no such file; name one, 'timm', or null") from None
-        except (SafetensorError, RuntimeError, OSError) as error:
-            reason = str(error).splitlines()[-1].strip()  # load_state_dict's first line names no tensor
-            raise InputError(f"backbone_weights {path}: does not fit {self.name} ({reason})") from None
-        if missing:
-            raise InputError(f"backbone_weights {path}: lacks {len(missing)} tensors of {self.name}, as {missing[0]}")
+
+class PooledBackbone(ImageBackbone):
+    """A timm model without its classifier: one globally average-pooled feature per image.
+
+    The arguments are those of :class:`Backbone`.
+
+    Shape:
+        image (B, 3, H, W) in 0..1 -> (B, width).
+
+    Raises:
+        InputError: for an unknown model or weights that do not fit.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        weights: str | None = None,
+        timm_args: dict[str, Any] | None = None,
+        pixel_mean: tuple[float, float, float] | None = None,
+        pixel_std: tuple[float, float, float] | None = None,
+    ) -> None:
+        body = _timm_model(name, weights, timm_args, num_classes=0, global_pool="avg")
+        config = body.pretrained_cfg
+        file = None if weights == "timm" else weights
+        super().__init__(name, body, file, pixel_mean or config["mean"], pixel_std or config["std"])
+        self.width: int = body.head_hidden_size
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Normalise the image and return its feature."""
+        return self.body(self.normalised(image))
+
+
+def _timm_model(name: str, weights: str | None, timm_args: dict[str, Any] | None, **cut: Any) -> Any:
+    """Build a timm model, with errors a user can act on."""
+    _check_known(name)
+    try:
+        return timm.create_model(name, pretrained=weights == "timm", **cut, **(timm_args or {}))
+    except TypeError as error:
+        raise InputError(f"backbone_args {timm_args}: {name} does not take them ({error})") from None
+    except (OSError, RuntimeError) as error:
+        if weights != "timm":
+            raise InputError(f"backbone {name!r}: timm cannot build it with {timm_args} ({error})") from error
+        raise InputError(
+            f"backbone_weights: timm's weights of {name} could not be fetched ({type(error).__name__}); "
+            "name a local .safetensors file instead, or null to start from scratch"
+        ) from error
+
+
+def _check_known(name: str) -> None:
+    if not timm.is_model(name):
+        near = get_close_matches(name, timm.list_models(), n=5) or ["see timm.list_models()"]
+        raise InputError(f"backbone {name!r}: timm has no such model; near ones: {', '.join(near)}")
 
 
 def _stages_at(name: str, strides: tuple[int, ...]) -> list[int]:
     """Index the deepest stage of a timm model at each stride."""
     if list(strides) != sorted(set(strides)):
         raise ValueError(f"strides rise, as the maps come finest first, not {strides}")
-    if not timm.is_model(name):
-        near = get_close_matches(name, timm.list_models(), n=5) or ["see timm.list_models()"]
-        raise InputError(f"backbone {name!r}: timm has no such model; near ones: {', '.join(near)}")
+    _check_known(name)
     try:
         with torch.device("meta"):
             model: Any = timm.create_model(name, features_only=True, feature_cls="getter")

@@ -10,15 +10,16 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 import mambaloc
+from mambaloc.geometry import canonical, transform
 from mambaloc.models import LitPoseRegressor
 from mambaloc.models.registry import model_class
 from mambaloc.nn import MambaMixer
-from mambaloc.types import PoseBatch, PosePrediction
+from mambaloc.types import Pose, PoseBatch, PosePrediction
 
 # What makes a system small and quick; each takes those arguments that it has.
 SMALL = {
-    "backbone": "mobilenetv3_small_050", "encoder_layers": 1, "dim": 32, "heads": 4, "feedforward": 32,
-    "head_hidden": 32,
+    "encoder_layers": 1, "dim": 32, "heads": 4, "feedforward": 32, "head_hidden": 32, "width": 64, "hidden": 16,
+    "stage_channels": 64, "blocks": 2, "groups": 4,
 }  # fmt: skip
 SIDE = 64
 
@@ -35,20 +36,37 @@ EACH_ONCE = pytest.mark.parametrize("name", mambaloc.list_models())
 
 
 def small(name: str, gis: str, seed: int = 0, **kwargs) -> LitPoseRegressor:
-    taken = inspect.signature(model_class(name)).parameters
+    taken = {
+        p
+        for c in model_class(name).__mro__
+        if issubclass(c, L.LightningModule)
+        for p in inspect.signature(c).parameters
+    }
     torch.manual_seed(seed)
     return mambaloc.create_model(
-        name, gis=gis, image_size=SIDE, **{k: v for k, v in SMALL.items() if k in taken}, **kwargs
+        name,
+        gis=gis,
+        image_size=SIDE,
+        backbone="mobilenetv3_small_050",
+        **{k: v for k, v in SMALL.items() if k in taken},
+        **kwargs,
     )
 
 
-def frames(count: int = 4, seed: int = 0) -> PoseBatch:
+def frames(count: int = 3, seed: int = 0) -> PoseBatch:
     generator = torch.Generator().manual_seed(seed)
+    position_m = torch.randn(count, 3, generator=generator)
+    quaternion = canonical(torch.randn(count, 4, generator=generator))
+    ahead_m = torch.randn(count, 32, 3, generator=generator) * 0.3 + torch.tensor([0.0, 0.0, 3.0])
+    coarse = torch.rand(count, 3, 4, 4, generator=generator)  # noise in every pixel would look all the same
     return PoseBatch(
-        torch.rand(count, 3, SIDE, SIDE, generator=generator),
-        torch.randn(count, 3, generator=generator),
-        torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1),
+        torch.nn.functional.interpolate(coarse, size=(SIDE, SIDE), mode="bilinear"),
+        position_m,
+        quaternion,
         torch.arange(count),
+        clip_length=count,
+        points_m=transform(Pose(position_m[:, None], quaternion[:, None]), ahead_m),
+        intrinsics=torch.tensor([[60.0, 0, SIDE / 2], [0, 60.0, SIDE / 2], [0, 0, 1]]).expand(count, 3, 3),
     )
 
 
@@ -61,7 +79,7 @@ def test_shapes_and_finiteness(name, gis):
     system = small(name, gis)
     for train in (True, False):
         prediction = system.train(train)(frames().image)
-        assert (prediction.position_m.shape, prediction.quaternion.shape) == ((4, 3), (4, 4))
+        assert (prediction.position_m.shape, prediction.quaternion.shape) == ((3, 3), (3, 4))
         assert flat(prediction).isfinite().all()
 
 
@@ -127,27 +145,44 @@ def test_optimiser_holds_every_parameter_once_and_decays_neither_dynamics_nor_lo
     groups = system.configure_optimizers()["optimizer"].param_groups
     held = [id(p) for group in groups for p in group["params"]]
     assert sorted(held) == sorted(id(p) for p in system.parameters() if p.requires_grad)
-    assert {group["weight_decay"] for group in groups} == {0.25, 0.0}
-
     undecayed = {id(p) for group in groups if group["weight_decay"] == 0 for p in group["params"]}
     mixers = [m for m in system.modules() if isinstance(m, MambaMixer)]
     assert bool(mixers) == (gis != "none")
     expected = {id(p) for m in mixers for p in (m.A_log, m.D)} | {id(p) for p in system.loss.parameters()}
     assert undecayed == expected
+    assert {group["weight_decay"] for group in groups} == ({0.25, 0.0} if expected else {0.25})
+
+
+def learned_by_heart(name: str, start: nn.Module | None = None, steps: int = 200) -> LitPoseRegressor:
+    """Train on eight frames without dropout at a falling rate: the median errors end under 5 cm and 3 degrees.
+
+    Batch norm stands still: its running statistics of so few pixels would be others than a batch's.
+    """
+    system, batch = small(name, "gis", lr=3e-3, dropout=0.0, weight_decay=0.0), frames(8)
+    if start is not None:
+        system.network.load_state_dict(start.state_dict())
+    optimizer = system.configure_optimizers()["optimizer"]
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=steps)
+    system.train()
+    for module in system.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.eval()
+    for _ in range(steps):
+        optimizer.zero_grad()
+        system.loss(system(batch.image), batch).backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        system.eval().val_errors.update(system(batch.image), batch)
+    errors = system.val_errors.compute()
+    assert errors["position_error_m"] < 0.05
+    assert errors["rotation_error_deg"] < 3
+    return system
 
 
 @pytest.mark.slow
 @EACH_ONCE
 def test_eight_frames_can_be_learned_by_heart(name):
-    system, batch = small(name, "gis", lr=3e-3).train(), frames(8)
-    optimizer = system.configure_optimizers()["optimizer"]
-
-    def step() -> Tensor:
-        prediction = system(batch.image)
-        optimizer.zero_grad()
-        system.loss(prediction, batch).backward()
-        optimizer.step()
-        return (prediction.position_m.detach() - batch.position_m).norm(dim=-1).mean()
-
-    errors_m = torch.stack([step() for _ in range(60)])
-    assert errors_m[-5:].mean() < 0.4 * errors_m[0]
+    # From afar the reprojection error is clipped and flat: it starts from learned weights, as its recipe does.
+    start = learned_by_heart("posenet_learned").network if name == "posenet_geometric" else None
+    learned_by_heart(name, start)

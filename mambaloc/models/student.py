@@ -1,0 +1,68 @@
+"""The student of MambaLoc's distillation: EfficientNet-B0 and two linear heads, small enough for a phone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from mambaloc.models.base import LitPoseRegressor
+from mambaloc.models.registry import register_model
+from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, build_gis
+from mambaloc.types import PosePrediction
+
+
+class Student(nn.Module):
+    """A pooled backbone, one layer, and a linear head each for position and rotation.
+
+    Args:
+        backbone: one feature per image.
+        width: of the latent feature and of GIS. 512 gives the paper's exact size; its text says 1024.
+        dropout: of the backbone's feature.
+        gis: ``gis``, ``classical`` or ``none``.
+        discretisation: of the state space: ``euler`` or ``zoh``.
+
+    Shape:
+        (B, 3, H, W) in 0..1 -> :class:`~mambaloc.types.PosePrediction`.
+    """
+
+    def __init__(
+        self,
+        backbone: PooledBackbone,
+        width: int = 512,
+        dropout: float = 0.1,
+        gis: GISMode = "none",
+        discretisation: Discretisation = "euler",
+    ) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.fc = nn.Sequential(nn.Dropout(dropout), nn.Linear(backbone.width, width), nn.ReLU())
+        self.position_gis = build_gis(gis, width, discretisation)
+        self.orientation_gis = build_gis(gis, width, discretisation)
+        self.head = PoseHead(width)
+
+    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return both branches' global features, what their heads read; (B, width) each."""
+        feats_BD = self.fc(self.backbone(image))
+        return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
+
+    def forward(self, image: Tensor) -> PosePrediction:
+        """Localise images."""
+        return self.head(*self.features(image))
+
+
+@register_model("student")
+class LitStudent(LitPoseRegressor):
+    """The student trained by itself, with learned weights as MambaLoc is.
+
+    The arguments are those of :class:`Student` and of :class:`~mambaloc.models.base.LitPoseRegressor`.
+    """
+
+    def __init__(
+        self, backbone: str = "efficientnet_b0", width: int = 512, dropout: float = 0.1, **shared: Any
+    ) -> None:
+        super().__init__(backbone=backbone, **shared)
+
+    def configure_network(self) -> Student:
+        """Build the network from the hyperparameters."""
+        return Student(PooledBackbone(**self.backbone_arguments), **self.hyperparameters_of(Student))
