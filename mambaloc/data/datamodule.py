@@ -14,33 +14,54 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from mambaloc import provenance
-from mambaloc.data.augmentation import Jitter, augment, center_crop, draw_augmentations
+from mambaloc.data.augmentation import Jitter, augment, center_corner, center_crop, draw_augmentations
 from mambaloc.data.cache import cached_frames
 from mambaloc.data.datasets import DATASETS, is_official, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
+from mambaloc.data.points import ScenePoints, read_points
 from mambaloc.data.splits import Validation, hold_out, subsample
 from mambaloc.errors import InputError
+from mambaloc.geometry import cropped_intrinsics, resized_intrinsics
 from mambaloc.types import PoseBatch, height_and_width
 
 Part = Literal["train", "val", "test"]
 
 
 class CachedFrames(Dataset[PoseBatch]):
-    """Frames of one part of a scene, already decoded; fetched a batch at a time."""
+    """Frames of one part of a scene, already decoded; fetched a batch at a time.
 
-    def __init__(self, frames: Frames, images: NDArray[np.uint8]) -> None:
-        self.frames, self.images = frames, images
+    Args:
+        frames: N posed frames.
+        images: the same, decoded: (N, 3, H, W).
+        points: what each may see, if batches are to carry it.
+    """
+
+    def __init__(self, frames: Frames, images: NDArray[np.uint8], points: ScenePoints | None = None) -> None:
+        self.frames, self.images, self.points = frames, images, points
         self.position_m = torch.from_numpy(frames.position_m).float()
         self.quaternion = torch.from_numpy(frames.quaternion).float()
+        self.points_m: Tensor | None = None
+        self.intrinsics: Tensor | None = None
+        if points:
+            scale_x, scale_y = images.shape[-1] / points.size_px[0], images.shape[-2] / points.size_px[1]
+            self.points_m = torch.from_numpy(points.points_m)
+            self.intrinsics = resized_intrinsics(torch.from_numpy(points.intrinsics), scale_x, scale_y)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __getitems__(self, indices: list[int]) -> PoseBatch:
-        """Fetch a batch: ``image`` (B, 3, H, W) uint8 as cached, uncropped."""
+        """Fetch a batch: ``image`` (B, 3, H, W) uint8 as cached, uncropped, and ``intrinsics`` of that image."""
         index = torch.tensor(indices)
         images = torch.from_numpy(np.stack([self.images[i] for i in indices]))
-        return PoseBatch(images, self.position_m[index], self.quaternion[index], index)
+        return PoseBatch(
+            images,
+            self.position_m[index],
+            self.quaternion[index],
+            index,
+            points_m=None if self.points_m is None else self.points_m[index],
+            intrinsics=None if self.intrinsics is None else self.intrinsics[index],
+        )
 
 
 @dataclass(frozen=True)
@@ -72,6 +93,8 @@ class PoseDataModule(L.LightningDataModule):
         val_sequences: sequences to hold out, by name.
         keep_every: train on every k-th frame of each sequence (sparsity 1/k).
         keep_count: train on so many frames, uniform in time, instead.
+        points_per_frame: scene points that training and validation frames carry, from depth frames,
+            ``reconstruction.nvm`` or a COLMAP model in the scene's folder; 0 reads none.
         on_bad_frame: ``error`` stops at a bad frame; ``skip`` leaves it out and counts it.
         cache_dir: where decoded frames are kept; ``$MAMBALOC_CACHE`` or the user's cache folder unless given.
     """
@@ -95,6 +118,7 @@ class PoseDataModule(L.LightningDataModule):
         val_sequences: list[str] | None = None,
         keep_every: int = 1,
         keep_count: int | None = None,
+        points_per_frame: int = 0,
         on_bad_frame: OnBadFrame = "error",
         cache_dir: str | None = None,
     ) -> None:
@@ -103,6 +127,8 @@ class PoseDataModule(L.LightningDataModule):
         self.crop = height_and_width(image_size)
         if max(self.crop) > short_side and min(self.crop) > short_side:
             raise InputError(f"data.image_size {image_size}: larger than data.short_side {short_side}; enlarge that")
+        if points_per_frame < 0:
+            raise InputError(f"data.points_per_frame {points_per_frame}: must be 0 or more; 0 reads none")
         self.jitter = Jitter(brightness, contrast, saturation)
         self._loaded: dict[Part, LoadedSplit] = {}
         self._listed: dict[str, int] = {}
@@ -121,8 +147,8 @@ class PoseDataModule(L.LightningDataModule):
         if needs_test and "test" not in self._loaded:
             frames, bad = self._read("test")
             self._loaded["test"] = self._decode(frames, bad)
-        if self.hparams["validation"] == "test_set" and "val" not in self._loaded:
-            self._loaded["val"] = self._loaded["test"]
+        if self.hparams["validation"] == "test_set" and stage in ("fit", "validate") and "val" not in self._loaded:
+            self._loaded["val"] = self._with_points(self._loaded["test"])
 
     @property
     def train_position_m(self) -> Tensor:
@@ -157,6 +183,7 @@ class PoseDataModule(L.LightningDataModule):
             "keep_count": hparams["keep_count"],
             "image_size": list(self.crop),
             "short_side": hparams["short_side"],
+            **self._describe_points(),
         }
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
@@ -176,12 +203,17 @@ class PoseDataModule(L.LightningDataModule):
         return self.test_dataloader()
 
     def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
-        """Crop and normalise on the device; jitter while training."""
+        """Crop and normalise on the device, jitter while training; intrinsics follow each image's crop."""
         if self.trainer is None or not self.trainer.training:
-            return replace(batch, image=center_crop(batch.image, self.crop))
-        seed = provenance.seed()
-        how = draw_augmentations(batch.image, self.crop, self.jitter, seed, self.trainer.current_epoch, batch.index)
-        return replace(batch, image=augment(batch.image, how, self.crop))
+            top, left = center_corner(batch.image, self.crop)
+            image = center_crop(batch.image, self.crop)
+        else:
+            seed = provenance.seed()
+            how = draw_augmentations(batch.image, self.crop, self.jitter, seed, self.trainer.current_epoch, batch.index)
+            top, left = how.top, how.left
+            image = augment(batch.image, how, self.crop)
+        intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, top, left)
+        return replace(batch, image=image, intrinsics=intrinsics)
 
     def _read(self, split: Split) -> tuple[Frames, BadFrames]:
         bad = BadFrames(self.hparams["on_bad_frame"])
@@ -203,6 +235,24 @@ class PoseDataModule(L.LightningDataModule):
             )
         return LoadedSplit(CachedFrames(frames.select(cache.rows), cache.images), bad)
 
+    def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
+        """Add what each frame may see, of the frames that could be decoded."""
+        count, data = self.hparams["points_per_frame"], loaded.data
+        if count == 0:
+            return loaded
+        points = read_points(self.folder, data.frames, count, provenance.seed())
+        return replace(loaded, data=CachedFrames(data.frames, data.images, points))
+
+    def _describe_points(self) -> dict[str, Any]:
+        """Where points come from, and the median of how many a frame has; nothing where none were read."""
+        points = {part: loaded.data.points for part, loaded in self._loaded.items() if loaded.data.points}
+        if not points:
+            return {}
+        return {
+            "points_source": {part: of.source for part, of in points.items()},
+            "points_per_frame": {part: float(np.median(of.per_frame())) for part, of in points.items()},
+        }
+
     def _load_train_and_val(self) -> None:
         frames, bad = self._read("train")
         train, validation = frames, self.hparams["validation"]
@@ -210,9 +260,9 @@ class PoseDataModule(L.LightningDataModule):
             options = {name: self.hparams[f"val_{name}"] for name in ("fraction", "gap", "sequences")}
             train_rows, val_rows = hold_out(frames, validation, **options)
             train = frames.select(train_rows)
-            self._loaded["val"] = self._decode(frames.select(val_rows), BadFrames(bad.policy))
+            self._loaded["val"] = self._with_points(self._decode(frames.select(val_rows), BadFrames(bad.policy)))
         kept = subsample(train, self.hparams["keep_every"], self.hparams["keep_count"])
-        self._loaded["train"] = self._decode(train.select(kept), bad)
+        self._loaded["train"] = self._with_points(self._decode(train.select(kept), bad))
 
     def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._loaded[part].data, self.trainer
