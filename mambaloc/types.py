@@ -25,6 +25,7 @@ Shape suffixes
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from torch import Tensor
 
@@ -64,7 +65,7 @@ class PoseBatch:
 
     def pin_memory(self) -> PoseBatch:
         """Copy to page-locked memory; the DataLoader calls it where ``pin_memory=True``."""
-        tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        tensors: dict[str, Any] = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **{name: tensor.pin_memory() for name, tensor in tensors.items()})
 
 

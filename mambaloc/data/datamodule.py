@@ -205,14 +205,14 @@ class PoseDataModule(L.LightningDataModule):
     def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
         """Crop and normalise on the device, jitter while training; intrinsics follow each image's crop."""
         if self.trainer is None or not self.trainer.training:
-            top, left = center_corner(batch.image, self.crop)
+            corner: tuple[Tensor | int, Tensor | int] = center_corner(batch.image, self.crop)
             image = center_crop(batch.image, self.crop)
         else:
             seed = provenance.seed()
             how = draw_augmentations(batch.image, self.crop, self.jitter, seed, self.trainer.current_epoch, batch.index)
-            top, left = how.top, how.left
+            corner = (how.top, how.left)
             image = augment(batch.image, how, self.crop)
-        intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, top, left)
+        intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, *corner)
         return replace(batch, image=image, intrinsics=intrinsics)
 
     def _read(self, split: Split) -> tuple[Frames, BadFrames]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mambaloc.data.frames import Frames
 from mambaloc.data.points.reconstructions import Reconstruction, plain_name, points_of_frames, rows_by_name
@@ -54,6 +55,10 @@ def read_colmap_points(folder: Path, frames: Frames, count: int, seed: int) -> S
         np.array([_pinhole(camera, size) for camera in cameras]).reshape(-1, 3, 3),
         [_observed(model, image) for image in images],
     )
+    focal = known.intrinsics[:, (0, 1), (0, 1)]
+    if not (np.isfinite(known.intrinsics).all() and np.isfinite(known.position_m).all() and (focal > 0).all()):
+        # COLMAP reads a file that is cut off without a word.
+        raise InputError(f"{path}: holds cameras that are not finite or have no focal length; export it again")
     return points_of_frames(known, path, frames, count, seed, size, "colmap")
 
 
@@ -70,12 +75,12 @@ def _load(path: Path) -> Any:
         raise InputError(message) from None
 
 
-def _observed(model: Any, image: Any) -> np.ndarray:
+def _observed(model: Any, image: Any) -> NDArray[np.float64]:
     points = [model.points3D[point.point3D_id].xyz for point in image.get_observation_points2D()]
     return np.array(points, dtype=np.float64).reshape(-1, 3)
 
 
-def _pinhole(camera: Any, size: tuple[int, int]) -> np.ndarray:
+def _pinhole(camera: Any, size: tuple[int, int]) -> NDArray[np.float64]:
     """A camera's pinhole matrix in pixels of images of a size (width, height), (3, 3)."""
     focal, centre = (camera.focal_length_x, camera.focal_length_y), (camera.principal_point_x, camera.principal_point_y)
     matrix = np.array([[focal[0], 0, centre[0] - 0.5], [0, focal[1], centre[1] - 0.5], [0, 0, 1]])

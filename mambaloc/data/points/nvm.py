@@ -15,6 +15,7 @@ from typing import TextIO
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.progress import track
 
 from mambaloc.data.frames import Frames
@@ -94,10 +95,12 @@ def _read_model(lines: _Lines, rows: dict[str, int], size: tuple[int, int]) -> R
                 seen[image].append(point)
     if len(lines.next().split()) > _POINT_NUMBERS:
         raise lines.error("follows the last of the points that were announced")
-    numbers = np.array([cameras[camera] for camera in known]).reshape(-1, 8)
-    quaternion = canonical(conjugate(torch.from_numpy(numbers[:, 1:5]))).numpy()
+    table = np.array([cameras[camera] for camera in known]).reshape(-1, 8)
+    quaternion = canonical(conjugate(torch.from_numpy(table[:, 1:5]))).numpy()
     points = [np.array(of).reshape(-1, 3) for of in seen.values()]
-    return Reconstruction(np.array([*known.values()], int), numbers[:, 5:], quaternion, _pinhole(numbers, size), points)
+    return Reconstruction(
+        np.array([*known.values()], int), table[:, 5:], quaternion, _pinhole(table[:, 0], size), points
+    )
 
 
 def _read_camera(lines: _Lines, line: str) -> tuple[str, list[float]]:
@@ -132,13 +135,10 @@ def _read_point(lines: _Lines, line: str, cameras: int) -> tuple[tuple[float, fl
     return (x, y, z), images
 
 
-def _pinhole(numbers: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Intrinsics of focal lengths at the centre of images of a size (width, height); (M, 8) -> (M, 3, 3)."""
-    intrinsics = np.tile(
-        np.array([[0, 0, (size[0] - 1) / 2], [0, 0, (size[1] - 1) / 2], [0, 0, 1.0]]), (len(numbers), 1, 1)
-    )
-    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = numbers[:, 0]
-    return intrinsics
+def _pinhole(focal_px: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Intrinsics of focal lengths at the centre of images of a size (width, height); (M,) -> (M, 3, 3)."""
+    centre = np.array([[0, 0, (size[0] - 1) / 2], [0, 0, (size[1] - 1) / 2], [0, 0, 1]])
+    return centre + focal_px[:, None, None] * np.diag([1.0, 1.0, 0.0])
 
 
 def _image_size(path: Path) -> tuple[int, int]:

@@ -64,7 +64,7 @@ def points_of_frames(
     agrees = _agrees(model, file, frames)
     points: list[Points] = [np.empty((0, 3))] * len(frames)
     intrinsics = np.tile(np.median(model.intrinsics, axis=0), (len(frames), 1, 1))
-    for camera in np.flatnonzero(agrees):
+    for camera in np.flatnonzero(agrees).tolist():
         row = model.rows[camera]
         intrinsics[row] = model.intrinsics[camera]
         seen = model.points_m[camera]
