@@ -261,14 +261,35 @@ def test_a_colmap_model_in_another_frame_is_refused(yard):
         read(yard)
 
 
-@pytest.mark.parametrize(("file", "keep"), [("images.bin", 40), ("points3D.bin", 30), ("cameras.bin", 12)])
+@pytest.mark.parametrize(
+    ("file", "keep"),
+    [
+        ("images.bin", 40),
+        ("images.bin", 0),
+        ("points3D.bin", 60),
+        ("points3D.bin", 30),
+        ("frames.bin", 50),
+        ("cameras.bin", 12),
+        ("cameras.bin", 60),
+    ],
+)
 def test_a_damaged_colmap_model_is_named_in_one_line(yard, file, keep):
     write_model(yard / "sparse/0", binary=True)
     damaged = yard / "sparse/0" / file
     damaged.write_bytes(damaged.read_bytes()[:keep])
-    with pytest.raises(InputError, match=r"sparse/0: ") as caught:
+    with pytest.raises(InputError, match=rf"sparse/0/{file}: is cut off") as caught:
         read(yard)
     assert "\n" not in str(caught.value)
+
+
+def test_a_count_that_lies_costs_no_memory(yard):
+    write_model(yard / "sparse/0", binary=True)
+    file = yard / "sparse/0" / "points3D.bin"
+    whole = file.read_bytes()
+    for place in (0, 8 + 43):  # of the points, and of the first one's track
+        file.write_bytes(whole[:place] + b"\xff" * 7 + whole[place + 7 :])
+        with pytest.raises(InputError, match=r"points3D\.bin: is cut off or counts more than it holds"):
+            read(yard)
 
 
 def test_without_pycolmap_the_extra_is_named(yard, monkeypatch):

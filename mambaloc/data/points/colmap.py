@@ -6,6 +6,7 @@ is taken: focal lengths and principal point, which COLMAP counts from the corner
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,13 @@ from mambaloc.errors import InputError
 from mambaloc.geometry import quaternion_from_matrix, resized_intrinsics
 
 COLMAP_FOLDERS = ("sparse/0", "sparse")
+
+# A record of a binary file: so many bytes, a name that ends in 0 or none, a count, and so many bytes an item.
+_RECORDS = {
+    "images.bin": (64, True, "<Q", 24),
+    "points3D.bin": (43, False, "<Q", 8),
+    "frames.bin": (64, False, "<I", 16),
+}
 
 
 def colmap_folder(folder: Path) -> Path | None:
@@ -57,7 +65,6 @@ def read_colmap_points(folder: Path, frames: Frames, count: int, seed: int) -> S
     )
     focal = known.intrinsics[:, (0, 1), (0, 1)]
     if not (np.isfinite(known.intrinsics).all() and np.isfinite(known.position_m).all() and (focal > 0).all()):
-        # COLMAP reads a file that is cut off without a word.
         raise InputError(f"{path}: holds cameras that are not finite or have no focal length; export it again")
     return points_of_frames(known, path, frames, count, seed, size, "colmap")
 
@@ -67,12 +74,34 @@ def _load(path: Path) -> Any:
         import pycolmap
     except ImportError:
         raise InputError(f"{path}: is read by pycolmap, which is missing; pip install 'mambaloc[colmap]'") from None
+    for name, record in _RECORDS.items():
+        if (path / name).is_file() and not _is_whole((path / name).read_bytes(), *record):
+            raise InputError(f"{path / name}: is cut off or counts more than it holds; export the model again")
     try:
-        return pycolmap.Reconstruction(path)
+        model = pycolmap.Reconstruction(path)
     except Exception as error:  # whatever COLMAP's C++ throws at a damaged file
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         message = f"{path}: is no COLMAP model that pycolmap can read ({reason[0][:200]}); export it again or remove it"
         raise InputError(message) from None
+    cameras, read = path / "cameras.bin", 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+    if cameras.is_file() and cameras.stat().st_size < read:  # COLMAP fills up what is missing
+        raise InputError(f"{cameras}: is cut off or counts more than it holds; export the model again")
+    return model
+
+
+def _is_whole(data: bytes, fixed: int, is_named: bool, count: str, item: int) -> bool:
+    """Whether the file holds what it counts: COLMAP believes a count, and fills the memory."""
+    try:
+        (records,) = struct.unpack_from("<Q", data)
+        at = 8
+        for _ in range(records):
+            at += fixed
+            at = data.index(b"\0", at) + 1 if is_named else at
+            (items,) = struct.unpack_from(count, data, at)
+            at += struct.calcsize(count) + item * items
+    except (struct.error, ValueError):
+        return False
+    return at <= len(data)
 
 
 def _observed(model: Any, image: Any) -> NDArray[np.float64]:
