@@ -282,6 +282,26 @@ def test_a_damaged_colmap_model_is_named_in_one_line(yard, file, keep):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("file", "line", "says"),
+    [
+        ("points3D.txt", "", "its colmap holds no point for any of 4 frames"),
+        ("cameras.txt", "1 PINHOLE 0 60 100 102 41 29\n", "holds a camera without a size"),
+        ("cameras.txt", "1 PINHOLE 80 60 0 102 41 29\n", "holds a camera without a size"),
+        ("cameras.txt", "1 PINHOLE 80 60 nan 102 41 29\n", "is no COLMAP model that pycolmap can read"),
+        ("cameras.txt", "1 PINHOLE\n", "is no COLMAP model that pycolmap can read"),
+        ("images.txt", "text\n\n", "is no COLMAP model that pycolmap can read"),
+    ],
+)
+def test_a_damaged_text_model_is_named_in_one_line(yard, file, line, says):
+    write_model(yard / "sparse", binary=False)
+    (yard / "sparse" / file).write_text(line)
+    with pytest.raises(InputError) as caught:
+        read(yard)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_count_that_lies_costs_no_memory(yard):
     write_model(yard / "sparse/0", binary=True)
     file = yard / "sparse/0" / "points3D.bin"

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich.progress import track
 
 from mambaloc.data.frames import Frames
 from mambaloc.data.points.reconstructions import Reconstruction, plain_name, points_of_frames, rows_by_name
@@ -54,6 +55,8 @@ def read_colmap_points(folder: Path, frames: Frames, count: int, seed: int) -> S
     model = _load(path)
     images = [image for image in model.images.values() if image.has_pose and plain_name(image.name) in rows]
     cameras = [model.cameras[image.camera_id] for image in images]
+    if not all(_is_sound(camera) for camera in cameras):
+        raise InputError(f"{path}: holds a camera without a size or a finite, positive focal length; export it again")
     size = (int(cameras[0].width), int(cameras[0].height)) if cameras else (1, 1)
     cam_from_world = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
     known = Reconstruction(
@@ -61,11 +64,8 @@ def read_colmap_points(folder: Path, frames: Frames, count: int, seed: int) -> S
         np.array([image.projection_center() for image in images]).reshape(-1, 3),
         quaternion_from_matrix(torch.from_numpy(cam_from_world[:, :, :3].transpose(0, 2, 1).copy())).numpy(),
         np.array([_pinhole(camera, size) for camera in cameras]).reshape(-1, 3, 3),
-        [_observed(model, image) for image in images],
+        [_observed(model, image) for image in track(images, "Reading points", transient=True)],
     )
-    focal = known.intrinsics[:, (0, 1), (0, 1)]
-    if not (np.isfinite(known.intrinsics).all() and np.isfinite(known.position_m).all() and (focal > 0).all()):
-        raise InputError(f"{path}: holds cameras that are not finite or have no focal length; export it again")
     return points_of_frames(known, path, frames, count, seed, size, "colmap")
 
 
@@ -105,8 +105,15 @@ def _is_whole(data: bytes, fixed: int, is_named: bool, count: str, item: int) ->
 
 
 def _observed(model: Any, image: Any) -> NDArray[np.float64]:
-    points = [model.points3D[point.point3D_id].xyz for point in image.get_observation_points2D()]
+    """The points that an image observes; ids without a point, as in a text that is cut off, are passed over."""
+    ids = [point.point3D_id for point in image.get_observation_points2D()]
+    points = [model.points3D[number].xyz for number in ids if model.exists_point3D(number)]
     return np.array(points, dtype=np.float64).reshape(-1, 3)
+
+
+def _is_sound(camera: Any) -> bool:
+    sizes = (camera.width, camera.height, camera.focal_length_x, camera.focal_length_y)
+    return bool(np.isfinite(camera.params).all()) and min(sizes) > 0
 
 
 def _pinhole(camera: Any, size: tuple[int, int]) -> NDArray[np.float64]:
