@@ -24,7 +24,7 @@ Shape suffixes
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from torch import Tensor
@@ -65,8 +65,8 @@ class PoseBatch:
 
     def pin_memory(self) -> PoseBatch:
         """Copy to page-locked memory; the DataLoader calls it where ``pin_memory=True``."""
-        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return PoseBatch(**{k: v.pin_memory() if isinstance(v, Tensor) else v for k, v in values.items()})
+        tensors: dict[str, Any] = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        return replace(self, **{name: tensor.pin_memory() for name, tensor in tensors.items()})
 
 
 def height_and_width(size: int | tuple[int, int]) -> tuple[int, int]:

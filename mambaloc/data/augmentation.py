@@ -89,5 +89,10 @@ def augment(image: Tensor, how: Augmentations, crop: tuple[int, int]) -> Tensor:
 
 def center_crop(image: Tensor, crop: tuple[int, int]) -> Tensor:
     """Take the middle of a batch; (B, 3, H, W) uint8 -> (B, 3, *crop) float32 in 0..1."""
-    top, left = (image.shape[-2] - crop[0]) // 2, (image.shape[-1] - crop[1]) // 2
+    top, left = center_corner(image, crop)
     return image[..., top : top + crop[0], left : left + crop[1]].float() / 255
+
+
+def center_corner(image: Tensor, crop: tuple[int, int]) -> tuple[int, int]:
+    """Row and column of the top-left pixel of a batch's centre crop; (B, 3, H, W) -> two numbers."""
+    return (image.shape[-2] - crop[0]) // 2, (image.shape[-1] - crop[1]) // 2

@@ -9,46 +9,22 @@ from typing import Any, Literal
 import lightning as L
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, DistributedSampler
+from torch.utils.data import DataLoader, DistributedSampler
 
 from mambaloc import provenance
-from mambaloc.data.augmentation import Jitter, augment, center_crop, draw_augmentations
+from mambaloc.data.augmentation import Jitter, augment, center_corner, center_crop, draw_augmentations
 from mambaloc.data.cache import cached_frames
+from mambaloc.data.cached_dataset import CachedFrames
 from mambaloc.data.datasets import DATASETS, is_official, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
+from mambaloc.data.points import read_points
 from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
 from mambaloc.errors import InputError
+from mambaloc.geometry import cropped_intrinsics
 from mambaloc.types import PoseBatch, height_and_width
 
 Part = Literal["train", "val", "test"]
-
-
-class CachedFrames(Dataset[PoseBatch]):
-    """Frames of one part of a scene, already decoded; fetched a batch at a time.
-
-    Args:
-        frames: the frames.
-        images: what each looks like, (N, 3, H, W).
-        clips: the frames of each item, (C, length); each frame by itself unless given.
-    """
-
-    def __init__(self, frames: Frames, images: NDArray[np.uint8], clips: NDArray[np.int64] | None = None) -> None:
-        self.frames, self.images = frames, images
-        self.clips = np.arange(len(frames))[:, None] if clips is None else clips
-        self.position_m = torch.from_numpy(frames.position_m).float()
-        self.quaternion = torch.from_numpy(frames.quaternion).float()
-
-    def __len__(self) -> int:
-        return len(self.clips)
-
-    def __getitems__(self, items: list[int]) -> PoseBatch:
-        """Fetch a batch of items, clip after clip: ``image`` (B, 3, H, W) uint8 as cached, uncropped."""
-        rows = self.clips[items].ravel()
-        index = torch.from_numpy(rows)
-        images = torch.from_numpy(np.stack([self.images[row] for row in rows]))
-        return PoseBatch(images, self.position_m[index], self.quaternion[index], index, self.clips.shape[1])
 
 
 @dataclass(frozen=True)
@@ -82,6 +58,8 @@ class PoseDataModule(L.LightningDataModule):
         keep_count: train on so many frames, uniform in time, instead.
         clip_length: train on clips of so many frames of a sequence, as MapNet does.
         clip_skip: frames from one of a clip to the next, counted before thinning.
+        points_per_frame: scene points that training and validation frames carry, from depth frames,
+            ``reconstruction.nvm`` or a COLMAP model in the scene's folder; 0 reads none.
         on_bad_frame: ``error`` stops at a bad frame; ``skip`` leaves it out and counts it.
         cache_dir: where decoded frames are kept; ``$MAMBALOC_CACHE`` or the user's cache folder unless given.
     """
@@ -107,6 +85,7 @@ class PoseDataModule(L.LightningDataModule):
         keep_count: int | None = None,
         clip_length: int = 1,
         clip_skip: int = 10,
+        points_per_frame: int = 0,
         on_bad_frame: OnBadFrame = "error",
         cache_dir: str | None = None,
     ) -> None:
@@ -115,6 +94,8 @@ class PoseDataModule(L.LightningDataModule):
         self.crop = height_and_width(image_size)
         if max(self.crop) > short_side and min(self.crop) > short_side:
             raise InputError(f"data.image_size {image_size}: larger than data.short_side {short_side}; enlarge that")
+        if points_per_frame < 0:
+            raise InputError(f"data.points_per_frame {points_per_frame}: must be 0 or more; 0 reads none")
         self.jitter = Jitter(brightness, contrast, saturation)
         self._loaded: dict[Part, LoadedSplit] = {}
         self._listed: dict[str, int] = {}
@@ -133,8 +114,8 @@ class PoseDataModule(L.LightningDataModule):
         if needs_test and "test" not in self._loaded:
             frames, bad = self._read("test")
             self._loaded["test"] = self._decode(frames, bad)
-        if self.hparams["validation"] == "test_set" and "val" not in self._loaded:
-            self._loaded["val"] = self._loaded["test"]
+        if self.hparams["validation"] == "test_set" and stage in ("fit", "validate") and "val" not in self._loaded:
+            self._loaded["val"] = self._with_points(self._loaded["test"])
 
     @property
     def train_position_m(self) -> Tensor:
@@ -171,6 +152,7 @@ class PoseDataModule(L.LightningDataModule):
             "clip_skip": hparams["clip_skip"],
             "image_size": list(self.crop),
             "short_side": hparams["short_side"],
+            **self._describe_points(),
         }
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
@@ -190,12 +172,17 @@ class PoseDataModule(L.LightningDataModule):
         return self.test_dataloader()
 
     def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
-        """Crop and normalise on the device; jitter while training."""
+        """Crop and normalise on the device, jitter while training; intrinsics follow each image's crop."""
         if self.trainer is None or not self.trainer.training:
-            return replace(batch, image=center_crop(batch.image, self.crop))
-        seed = provenance.seed()
-        how = draw_augmentations(batch.image, self.crop, self.jitter, seed, self.trainer.current_epoch, batch.index)
-        return replace(batch, image=augment(batch.image, how, self.crop))
+            corner: tuple[Tensor | int, Tensor | int] = center_corner(batch.image, self.crop)
+            image = center_crop(batch.image, self.crop)
+        else:
+            seed = provenance.seed()
+            how = draw_augmentations(batch.image, self.crop, self.jitter, seed, self.trainer.current_epoch, batch.index)
+            corner = (how.top, how.left)
+            image = augment(batch.image, how, self.crop)
+        intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, *corner)
+        return replace(batch, image=image, intrinsics=intrinsics)
 
     def _read(self, split: Split) -> tuple[Frames, BadFrames]:
         bad = BadFrames(self.hparams["on_bad_frame"])
@@ -217,6 +204,32 @@ class PoseDataModule(L.LightningDataModule):
             )
         return LoadedSplit(CachedFrames(frames.select(cache.rows), cache.images), bad)
 
+    def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
+        """Add what each frame may see, of the frames that could be decoded."""
+        count, data = self.hparams["points_per_frame"], loaded.data
+        if count == 0:
+            return loaded
+        points = read_points(self.folder, data.frames, count, provenance.seed())
+        return replace(loaded, data=CachedFrames(data.frames, data.images, points))
+
+    def _in_clips(self, loaded: LoadedSplit, thinned_by: float) -> LoadedSplit:
+        """Make an item of each clip; neighbours of a thinned sequence lie farther apart already."""
+        length, data = self.hparams["clip_length"], loaded.data
+        if length == 1:
+            return loaded
+        clips = clips_of(data.frames, length, max(1, round(self.hparams["clip_skip"] / thinned_by)))
+        return replace(loaded, data=CachedFrames(data.frames, data.images, data.points, clips))
+
+    def _describe_points(self) -> dict[str, Any]:
+        """Where points come from, and the median of how many a frame has; nothing where none were read."""
+        points = {part: loaded.data.points for part, loaded in self._loaded.items() if loaded.data.points}
+        if not points:
+            return {}
+        return {
+            "points_source": {part: of.source for part, of in points.items()},
+            "points_per_frame": {part: float(np.median(of.per_frame())) for part, of in points.items()},
+        }
+
     def _load_train_and_val(self) -> None:
         frames, bad = self._read("train")
         train, validation = frames, self.hparams["validation"]
@@ -224,14 +237,10 @@ class PoseDataModule(L.LightningDataModule):
             options = {name: self.hparams[f"val_{name}"] for name in ("fraction", "gap", "sequences")}
             train_rows, val_rows = hold_out(frames, validation, **options)
             train = frames.select(train_rows)
-            self._loaded["val"] = self._decode(frames.select(val_rows), BadFrames(bad.policy))
+            self._loaded["val"] = self._with_points(self._decode(frames.select(val_rows), BadFrames(bad.policy)))
         kept = subsample(train, self.hparams["keep_every"], self.hparams["keep_count"])
-        loaded = self._decode(train.select(kept), bad)
-        if (length := self.hparams["clip_length"]) != 1:
-            skip = max(1, round(self.hparams["clip_skip"] * len(kept) / len(train)))
-            clips = clips_of(loaded.data.frames, length, skip)
-            loaded = replace(loaded, data=CachedFrames(loaded.data.frames, loaded.data.images, clips))
-        self._loaded["train"] = loaded
+        loaded = self._with_points(self._decode(train.select(kept), bad))
+        self._loaded["train"] = self._in_clips(loaded, len(train) / len(kept))
 
     def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._loaded[part].data, self.trainer

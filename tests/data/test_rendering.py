@@ -320,6 +320,20 @@ def test_embedded_scene_of_another_version_is_left_alone(tmp_path):
         ensure_embedded_scene(tmp_path)
 
 
+@pytest.mark.usefixtures("quick_embedded")
+def test_embedded_scene_has_depth_for_every_tenth_frame_and_gets_it_later(tmp_path):
+    folder = ensure_embedded_scene(tmp_path)
+    depths = {path: path.read_bytes() for path in folder.rglob("*.depth.png")}
+    numbers = {int(path.name[6:12]) for path in folder.rglob("*.color.jpg")}
+    assert {int(path.name[6:12]) for path in depths} == {number for number in numbers if number % 10 == 0} != set()
+    others = {path: path.stat().st_mtime_ns for path in folder.rglob("*.*") if path not in depths}
+    for path in depths:
+        path.unlink()  # as in a scene that an older version rendered
+    assert ensure_embedded_scene(tmp_path) == folder
+    assert {path: path.read_bytes() for path in folder.rglob("*.depth.png")} == depths
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.*") if path not in depths} == others
+
+
 # Tables of poses
 
 HEADER = "scene,split,image,x,y,z,qw,qx,qy,qz\n"

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from filelock import FileLock
 
-from mambaloc.data.rendering.layouts import GENERATOR_VERSION, scene_note, write_7scenes
+from mambaloc.data.rendering.layouts import (
+    GENERATOR_VERSION,
+    add_depth,
+    depth_file,
+    has_depth,
+    scene_note,
+    write_7scenes,
+)
 from mambaloc.data.rendering.room import furnished_room
 from mambaloc.data.rendering.shots import Shot, shots_of_sequences
 from mambaloc.data.rendering.trajectories import smooth_trajectory
@@ -24,10 +32,13 @@ _FRAMES = 120  # in a training sequence; half as many in a test sequence
 _STEP_DEG = 2.4  # as if every other frame of a hand-held recording was kept
 _STARTS_DEG = {1: 0.0, 2: 45.0, 3: 90.0, 4: 180.0, 5: 225.0, 6: 270.0}
 _TEST = (2, 5)
+_DEPTH_EVERY = 10  # frames between lend each other their points
 
 
 def ensure_embedded_scene(root: Path) -> Path:
     """The folder of the embedded scene under ``root``, rendered there on first use (seconds), in the 7-Scenes layout.
+
+    Every tenth frame has depth, also in a scene that was rendered before there was any.
 
     Two processes may call this at once: one renders, the other waits. A scene that another version of the
     generator made is left alone, and the new one gets another name.
@@ -39,6 +50,7 @@ def ensure_embedded_scene(root: Path) -> Path:
     note = scene_note(shots, _SIZE, _SEED)
     names = (EMBEDDED_SCENE, f"{EMBEDDED_SCENE}-v{GENERATOR_VERSION}")
     if folder := _rendered(root, names, note):
+        _add_missing_depth(folder, shots)
         return folder
     root.mkdir(parents=True, exist_ok=True)
     with FileLock(root / f".{EMBEDDED_SCENE}.lock"):
@@ -47,7 +59,9 @@ def ensure_embedded_scene(root: Path) -> Path:
         for name in names:
             if not (root / name).exists():
                 room = furnished_room(_INSIDE_M, _SEED)
-                return write_7scenes(root, name, shots, room=room, size=_SIZE, seed=_SEED)
+                return write_7scenes(
+                    root, name, shots, room=room, size=_SIZE, seed=_SEED, depth=True, depth_every=_DEPTH_EVERY
+                )
     raise InputError(f"{root / names[-1]}: is not what this version renders; remove it, or choose another root")
 
 
@@ -64,6 +78,15 @@ def embedded_shots() -> list[Shot]:
         for number, start_deg in _STARTS_DEG.items()
     }
     return shots_of_sequences(sequences, _TEST, "seq-{sequence:02d}/frame-{frame:06d}.color.jpg")
+
+
+def _add_missing_depth(folder: Path, shots: Iterable[Shot]) -> None:
+    due = [shot for shot in shots if has_depth(shot, _DEPTH_EVERY)]
+    if all((folder / depth_file(shot)).is_file() for shot in due):
+        return
+    with suppress(OSError), FileLock(folder.parent / f".{EMBEDDED_SCENE}.lock"):  # read-only, it stays as it is
+        if missing := [shot for shot in due if not (folder / depth_file(shot)).is_file()]:
+            add_depth(folder, missing, furnished_room(_INSIDE_M, _SEED), _SIZE)
 
 
 def _rendered(root: Path, names: Iterable[str], note: object) -> Path | None:

@@ -24,6 +24,7 @@ from mambaloc.data.rendering.quads import Image, Room
 from mambaloc.data.rendering.renderer import default_intrinsics, render, sensor
 from mambaloc.data.rendering.room import room_around
 from mambaloc.data.rendering.shots import Shot
+from mambaloc.data.rendering.tracks import write_nvm
 from mambaloc.errors import InputError
 
 GENERATOR_VERSION = 1
@@ -43,6 +44,7 @@ def write_7scenes(
     size: tuple[int, int] = (320, 240),
     seed: int = 0,
     depth: bool = False,
+    depth_every: int = 1,
 ) -> Path:
     """Render a scene into ``root/scene`` as 7-Scenes lays it out; a run that is cut off leaves nothing there.
 
@@ -54,6 +56,7 @@ def write_7scenes(
         size: ``(width, height)`` of the pictures, taken with :func:`default_intrinsics`.
         seed: of the room and of the sensor's noise.
         depth: also write ``.depth.png``: ``uint16`` millimetres, 65535 where there is nothing or it is farther.
+        depth_every: that of frames whose number this divides, as real captures have it.
 
     Returns:
         The scene's folder. Beside the frames, ``scene.json`` says how it was made.
@@ -72,9 +75,8 @@ def write_7scenes(
     def write_labels(image: Path, shot: Shot, depth_m: NDArray[np.float32]) -> None:
         stem = image.name.partition(".")[0]
         np.savetxt(image.with_name(f"{stem}.pose.txt"), shot.world_from_cam, fmt="% .10e", delimiter="\t")
-        if depth:
-            depth_mm = np.where((depth_m > 0) & (depth_m < 65.535), depth_m * 1000, 65535)
-            _write_image(image.with_name(f"{stem}.depth.png"), depth_mm.astype(np.uint16))
+        if depth and has_depth(shot, depth_every):
+            _write_depth(folder / depth_file(shot), depth_m)
 
     with _new_folder(root, scene) as folder:
         _render_all(folder, shots, room, size, seed, write_labels)
@@ -92,13 +94,22 @@ def write_cambridge(
     room: Room | None = None,
     size: tuple[int, int] = (320, 240),
     seed: int = 0,
+    points: bool = False,
 ) -> Path:
     """Render a scene into ``root/scene`` as Cambridge Landmarks lays it out; the arguments of :func:`write_7scenes`.
 
-    The label files hold the camera centre and the **world-to-camera** quaternion, as the official ones do.
+    The label files hold the camera centre and the **world-to-camera** quaternion, as the official ones do. With
+    ``points`` there is a ``reconstruction.nvm``, too; until it is written every depth is held, two bytes a pixel.
     """
+    depths_m: dict[str, NDArray[np.float16]] = {}
+
+    def keep_depth(image: Path, shot: Shot, depth_m: NDArray[np.float32]) -> None:
+        depths_m[shot.image] = depth_m.astype(np.float16)
+
     with _new_folder(root, scene) as folder:
-        _render_all(folder, shots, room, size, seed)
+        _render_all(folder, shots, room, size, seed, keep_depth if points else None)
+        if points:
+            write_nvm(folder / "reconstruction.nvm", shots, depths_m, default_intrinsics(size), seed)
         for split in _SPLIT_TITLES:
             lines = [_cambridge_line(shot) for shot in shots if shot.split == split]
             (folder / f"dataset_{split}.txt").write_text(_CAMBRIDGE_HEADER + "".join(lines))
@@ -115,6 +126,28 @@ def scene_note(shots: Sequence[Shot], size: tuple[int, int], seed: int) -> dict[
         "intrinsics_px": default_intrinsics(size).tolist(),
         "frames": dict(Counter(shot.split for shot in shots)),
     }
+
+
+def has_depth(shot: Shot, every: int) -> bool:
+    """Whether a 7-Scenes frame is among those with depth: every so many-th of its sequence, by its number."""
+    return int(Path(shot.image).name.partition(".")[0].removeprefix("frame-")) % every == 0
+
+
+def depth_file(shot: Shot) -> str:
+    """Where a 7-Scenes frame's depth lies, relative to the scene's folder."""
+    return f"{shot.image.partition('.')[0]}.depth.png"
+
+
+def add_depth(folder: Path, shots: Sequence[Shot], room: Room, size: tuple[int, int]) -> None:
+    """Write the depth frames of some shots of a scene that is there already, each complete or not at all."""
+    with TemporaryDirectory(prefix=".depth-", dir=folder) as draft, ThreadPoolExecutor(os.cpu_count()) as pool:
+
+        def take(number: int) -> None:
+            _, depth_m = render(room, default_intrinsics(size), shots[number].world_from_cam, size)
+            _write_depth(Path(draft) / f"{number}.png", depth_m)
+            (Path(draft) / f"{number}.png").replace(folder / depth_file(shots[number]))
+
+        list(pool.map(take, range(len(shots))))
 
 
 @contextmanager
@@ -172,10 +205,15 @@ def _render_all(
     (folder / "scene.json").write_text(json.dumps(scene_note(shots, size, seed), indent=2) + "\n")
 
 
-def _write_image(path: Path, image: Image) -> None:
+def _write_image(path: Path, image: Image | NDArray[np.uint16]) -> None:
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if path.suffix == ".jpg" else []
     if not cv2.imwrite(str(path), image, options):
         raise OSError(f"{path}: could not be written")
+
+
+def _write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
+    depth_mm = np.where((depth_m > 0) & (depth_m < 65.535), depth_m * 1000, 65535)
+    _write_image(path, depth_mm.astype(np.uint16))
 
 
 def _cambridge_line(shot: Shot) -> str:

@@ -1,0 +1,59 @@
+"""Decoded frames as a dataset that is fetched a batch at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from mambaloc.data.frames import Frames
+from mambaloc.data.points import ScenePoints
+from mambaloc.geometry import resized_intrinsics
+from mambaloc.types import PoseBatch
+
+
+class CachedFrames(Dataset[PoseBatch]):
+    """Frames of one part of a scene, already decoded; an item is a frame, or a clip of them.
+
+    Args:
+        frames: N posed frames.
+        images: the same, decoded: (N, 3, H, W).
+        points: what each may see, if batches are to carry it.
+        clips: the frames of each item, (C, length); each frame by itself unless given.
+    """
+
+    def __init__(
+        self,
+        frames: Frames,
+        images: NDArray[np.uint8],
+        points: ScenePoints | None = None,
+        clips: NDArray[np.int64] | None = None,
+    ) -> None:
+        self.frames, self.images, self.points = frames, images, points
+        self.clips = np.arange(len(frames))[:, None] if clips is None else clips
+        self.position_m = torch.from_numpy(frames.position_m).float()
+        self.quaternion = torch.from_numpy(frames.quaternion).float()
+        self.points_m: Tensor | None = None
+        self.intrinsics: Tensor | None = None
+        if points:
+            scale_x, scale_y = images.shape[-1] / points.size_px[0], images.shape[-2] / points.size_px[1]
+            self.points_m = torch.from_numpy(points.points_m)
+            self.intrinsics = resized_intrinsics(torch.from_numpy(points.intrinsics), scale_x, scale_y)
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitems__(self, items: list[int]) -> PoseBatch:
+        """Fetch items, clip after clip: ``image`` (B, 3, H, W) uint8 as cached, uncropped, with its ``intrinsics``."""
+        index = torch.from_numpy(self.clips[items].ravel())
+        return PoseBatch(
+            torch.from_numpy(np.stack([self.images[row] for row in index.tolist()])),
+            self.position_m[index],
+            self.quaternion[index],
+            index,
+            clip_length=self.clips.shape[1],
+            points_m=None if self.points_m is None else self.points_m[index],
+            intrinsics=None if self.intrinsics is None else self.intrinsics[index],
+        )

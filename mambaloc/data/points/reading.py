@@ -1,0 +1,47 @@
+"""Find what a scene knows of its points: depth frames, an NVM model, a COLMAP model, in this order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mambaloc.data.frames import Frames
+from mambaloc.data.points.colmap import COLMAP_FOLDERS, colmap_folder, read_colmap_points
+from mambaloc.data.points.depth import depth_path, depth_rows, read_depth_points
+from mambaloc.data.points.nvm import NVM_FILE, read_nvm_points
+from mambaloc.data.points.scene_points import ScenePoints
+from mambaloc.errors import InputError
+
+
+def read_points(folder: Path, frames: Frames, count: int, seed: int) -> ScenePoints:
+    """Read scene points that frames may see.
+
+    Args:
+        folder: the scene's.
+        frames: the frames asked for, N of them with readable images.
+        count: points a frame, P; where there are more, a draw that depends on the seed and the frame's name alone.
+        seed: of the draw.
+
+    Returns:
+        N rows in the order of ``frames``; a frame without any point is all NaN.
+
+    Raises:
+        InputError: where there is no source of points, it is malformed, or no frame has any point.
+    """
+    if depth_rows(frames):
+        points = read_depth_points(folder, frames, count, seed)
+    elif (folder / NVM_FILE).is_file():
+        points = read_nvm_points(folder, frames, count, seed)
+    elif colmap_folder(folder):
+        points = read_colmap_points(folder, frames, count, seed)
+    else:
+        raise InputError(
+            f"{folder}: has no scene points for data.points_per_frame: no depth frame such as "
+            f"{depth_path(frames.image_paths[0]).relative_to(folder)}, no {NVM_FILE}, no COLMAP model in "
+            f"{' or '.join(COLMAP_FOLDERS)}; add one of them, or choose a model that needs no points"
+        )
+    if not points.per_frame().any():
+        raise InputError(
+            f"{folder}: its {points.source} holds no point for any of {len(frames)} frames; "
+            "mend it, or choose a model that needs no points"
+        )
+    return points

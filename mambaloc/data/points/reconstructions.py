@@ -1,0 +1,88 @@
+"""What a structure-from-motion model says of some frames, whatever file it came in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mambaloc.data.frames import Frames
+from mambaloc.data.points.scene_points import Points, ScenePoints, Source, choose, frame_rng, stacked
+from mambaloc.errors import InputError
+from mambaloc.geometry import rotation_error_deg
+
+TOLERANCE_M = 0.1
+TOLERANCE_DEG = 1.0
+FARTHEST_M = 1e5
+"""Points farther from the world's origin are triangulated from nearly parallel rays: noise, and left out."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The M cameras of a model that are among the frames asked for, and the points each of them sees.
+
+    Shape:
+        ``rows`` (M,), each camera's row among the frames; ``position_m`` (M, 3) and ``quaternion`` (M, 4), its
+        ``world_from_cam``; ``intrinsics`` (M, 3, 3); ``points_m`` holds M arrays (K, 3).
+    """
+
+    rows: NDArray[np.int64]
+    position_m: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+    points_m: Sequence[Points]
+
+
+def rows_by_name(folder: Path, frames: Frames) -> dict[str, int]:
+    """Rows of frames by the name that a model knows them by: :func:`plain_name` of the path in the scene's folder."""
+    return {plain_name(path.relative_to(folder).as_posix()): row for row, path in enumerate(frames.image_paths)}
+
+
+def plain_name(image: str) -> str:
+    """An image's path without suffix: models are made of ``.jpg`` where the dataset ships ``.png``."""
+    path = PurePosixPath(image.replace("\\", "/"))
+    return str(path.parent / path.stem)
+
+
+def points_of_frames(
+    model: Reconstruction, file: Path, frames: Frames, count: int, seed: int, size_px: tuple[int, int], source: Source
+) -> ScenePoints:
+    """Each frame's points, at most ``count``. A frame that the model does not know, or knows in another pose, has none.
+
+    Raises:
+        InputError: where no frame is in the model, or most have another pose there.
+    """
+    if not len(model.rows):
+        raise InputError(
+            f"{file}: holds none of {len(frames)} frames, such as {frames.image_paths[0]}; "
+            "name the model's images by their path in the scene's folder"
+        )
+    agrees = _agrees(model, file, frames)
+    points: list[Points] = [np.empty((0, 3))] * len(frames)
+    intrinsics = np.tile(np.median(model.intrinsics, axis=0), (len(frames), 1, 1))
+    for camera in np.flatnonzero(agrees).tolist():
+        row = model.rows[camera]
+        intrinsics[row] = model.intrinsics[camera]
+        seen = model.points_m[camera]
+        near = seen[np.abs(seen).max(axis=1, initial=0) <= FARTHEST_M]
+        points[row] = choose(near, count, frame_rng(seed, frames.image_paths[row]))
+    return ScenePoints(stacked(points, count), intrinsics.astype(np.float32), size_px, source)
+
+
+def _agrees(model: Reconstruction, file: Path, frames: Frames) -> NDArray[np.bool_]:
+    """Which cameras have the dataset's pose, (M,)."""
+    apart_m = np.linalg.norm(model.position_m - frames.position_m[model.rows], axis=1)
+    true = torch.from_numpy(frames.quaternion[model.rows])
+    apart_deg = rotation_error_deg(torch.from_numpy(model.quaternion), true).numpy()
+    agrees = (apart_m <= TOLERANCE_M) & (apart_deg <= TOLERANCE_DEG)
+    if agrees.mean() < 0.5:
+        raise InputError(
+            f"{file}: its cameras are up to {apart_m.max():.3g} m and {apart_deg.max():.3g} degrees off the dataset's "
+            f"poses, more than {TOLERANCE_M:g} m and {TOLERANCE_DEG:g} degrees; bring the model into their frame and "
+            "scale (colmap model_aligner), or remove it"
+        )
+    return agrees
