@@ -22,7 +22,7 @@ def scenes(tmp_path_factory):
     root = tmp_path_factory.mktemp("scenes")
     inside_m = ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))
     sequences = {n: smooth_trajectory(8 if n == 3 else 12, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
-    write_7scenes(root, "heads", shots_of_sequences(sequences, {3}), size=(96, 72))
+    write_7scenes(root, "heads", shots_of_sequences(sequences, {3}), size=(96, 72), depth=True)
     return root
 
 

@@ -153,27 +153,24 @@ def test_optimiser_holds_every_parameter_once_and_decays_neither_dynamics_nor_lo
     assert {group["weight_decay"] for group in groups} == ({0.25, 0.0} if expected else {0.25})
 
 
-def learned_by_heart(name: str, start: nn.Module | None = None, steps: int = 200) -> LitPoseRegressor:
+def learned_by_heart(name: str, start: nn.Module | None = None, lr: float = 1e-3, steps: int = 200) -> LitPoseRegressor:
     """Train on eight frames without dropout at a falling rate: the median errors end under 5 cm and 3 degrees.
 
-    Batch norm stands still: its running statistics of so few pixels would be others than a batch's.
+    The errors are those of the last step: batch norm's running statistics of so few pixels are others than a batch's.
     """
-    system, batch = small(name, "gis", lr=3e-3, dropout=0.0, weight_decay=0.0), frames(8)
+    system, batch = small(name, "gis", lr=lr, dropout=0.0, weight_decay=0.0), frames(8)
     if start is not None:
         system.network.load_state_dict(start.state_dict())
     optimizer = system.configure_optimizers()["optimizer"]
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=steps)
     system.train()
-    for module in system.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.eval()
     for _ in range(steps):
+        prediction = system(batch.image)
         optimizer.zero_grad()
-        system.loss(system(batch.image), batch).backward()
+        system.loss(prediction, batch).backward()
         optimizer.step()
         schedule.step()
-    with torch.no_grad():
-        system.eval().val_errors.update(system(batch.image), batch)
+    system.val_errors.update(prediction, batch)
     errors = system.val_errors.compute()
     assert errors["position_error_m"] < 0.05
     assert errors["rotation_error_deg"] < 3
@@ -185,4 +182,4 @@ def learned_by_heart(name: str, start: nn.Module | None = None, steps: int = 200
 def test_eight_frames_can_be_learned_by_heart(name):
     # From afar the reprojection error is clipped and flat: it starts from learned weights, as its recipe does.
     start = learned_by_heart("posenet_learned").network if name == "posenet_geometric" else None
-    learned_by_heart(name, start)
+    learned_by_heart(name, start, lr=1e-4 if start else 1e-3)

@@ -21,14 +21,17 @@ def cambridge(tmp_path_factory):
     root = tmp_path_factory.mktemp("cambridge")
     inside_m = ((-4.0, -4.0, 1.5), (4.0, 4.0, 2.5))
     sequences = {n: smooth_trajectory(6, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
-    write_cambridge(root, "KingsCollege", shots_of_sequences(sequences, {3}, FRAME_CAMBRIDGE), size=(96, 54))
+    write_cambridge(
+        root, "KingsCollege", shots_of_sequences(sequences, {3}, FRAME_CAMBRIDGE), size=(96, 54), points=True
+    )
     return root
 
 
 def stand_in(recipe: Path, scenes: Path, cambridge: Path) -> list[str]:
     """Options that put a small rendered scene in the place of data and weights that are not there."""
     data = yaml.safe_load(recipe.read_text())["data"]
-    options = ["--model.backbone_weights", "null", "--trainer.accelerator", "cpu"]
+    options = ["--model.backbone_weights", "null", "--model.warm_start", "null", "--trainer.accelerator", "cpu"]
+    options += ["--data.image_size", "48", "--data.short_side", "48"]
     if data["dataset"] == "cambridge":
         return [*options, "--data.root", str(cambridge), "--data.scene", "KingsCollege"]
     return [*options, "--data.dataset", "7scenes", "--data.root", str(scenes), "--data.scene", "heads"]
@@ -47,11 +50,14 @@ def test_recipe_runs(recipe, scenes, cambridge, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("overlay", OVERLAYS, ids=lambda path: path.stem)
 def test_overlay_changes_what_it_says(overlay, tiny_recipe, tmp_path):
-    plain = main([str(tiny_recipe), "--trainer.fast_dev_run", "1"])
-    cli = main([str(tiny_recipe), str(overlay), "--trainer.fast_dev_run", "1"])
-    changed = yaml.safe_load(overlay.read_text())
-    for section, values in changed.items():
-        for key, value in (values.get("init_args") or values).items():
-            hparams = (cli.model if section == "model" else cli.datamodule).hparams
-            assert hparams[key] == value
-            assert hparams[key] != (plain.model if section == "model" else plain.datamodule).hparams[key]
+    def run(*recipes):
+        cli = main([*map(str, recipes), "--trainer.fast_dev_run", "1"])
+        return {"model": cli.model.hparams, "data": cli.datamodule.hparams}
+
+    base = [tiny_recipe, overlay.with_name("gis_none.yaml")] if overlay.stem == "gis" else [tiny_recipe]
+    plain, changed = run(*base), run(*base, overlay)
+    for section, values in yaml.safe_load(overlay.read_text()).items():
+        if section in plain:
+            values = values.get("init_args") or values
+            assert {key: changed[section][key] for key in values} == values
+            assert changed[section] != plain[section]
