@@ -53,7 +53,7 @@ class PoseDataModule(L.LightningDataModule):
         validation: how the best epoch is chosen; ``test_set`` selects on the test set and is reported as such.
         val_fraction: share of the training frames that is held out.
         val_gap: frames dropped between a held-out block and training frames.
-        val_sequences: sequences to hold out, by name.
+        val_sequences: sequences to hold out, by name; with ``validation: block``, those whose ends to hold out.
         keep_every: train on every k-th frame of each sequence (sparsity 1/k).
         keep_count: train on so many frames, uniform in time, instead.
         clip_length: train on clips of so many frames of a sequence, as MapNet does.

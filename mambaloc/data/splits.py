@@ -33,7 +33,7 @@ def hold_out(
         fraction: share of frames to hold out: sequences from the last on until it is reached, or the end of each
             sequence.
         gap: frames dropped between a block and what is trained on.
-        sequences: the sequences to hold out, by name, instead of a fraction.
+        sequences: by name, the sequences to hold out instead of a fraction; or whose ends to hold out as blocks.
 
     Returns:
         Indices to train on and to validate on, (T,) and (V,).
@@ -42,14 +42,21 @@ def hold_out(
         InputError: where one of the two would be empty, a sequence is not there, or a number is out of range.
     """
     by_sequence = frames.by_sequence()
-    if not sequences and not 0 < fraction < 1:
+    if not 0 < fraction < 1:
         raise InputError(f"data.val_fraction {fraction}: must lie between 0 and 1; or use data.validation: none")
     if gap < 0:
         raise InputError(f"data.val_gap {gap}: must be 0 or more, or the two would overlap")
-    if sequences or validation == "sequences" or (validation == "auto" and len(by_sequence) > 1):
+    unknown = [name for name in sequences or [] if name not in by_sequence]
+    if unknown:
+        raise InputError(f"data.val_sequences: no {unknown[0]} in the training split; it has {', '.join(by_sequence)}")
+    if validation == "sequences" or (validation == "auto" and (sequences or len(by_sequence) > 1)):
         held_out = sequences or _last_sequences(by_sequence, round(fraction * len(frames)))
         return _by_sequences(by_sequence, held_out)
-    blocks = [_block(indices, fraction, gap) for indices in by_sequence.values()]
+    nothing = np.empty(0, dtype=np.int64)
+    blocks = [
+        _block(indices, fraction, gap) if not sequences or name in sequences else (indices, nothing)
+        for name, indices in by_sequence.items()
+    ]
     train, val = (np.concatenate(part) for part in zip(*blocks, strict=True))
     if not len(train) or not len(val):
         raise InputError(
@@ -71,9 +78,6 @@ def _last_sequences(by_sequence: dict[str, NDArray[np.int64]], wanted: int) -> l
 def _by_sequences(
     by_sequence: dict[str, NDArray[np.int64]], held_out: list[str]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    unknown = [name for name in held_out if name not in by_sequence]
-    if unknown:
-        raise InputError(f"data.val_sequences: no {unknown[0]} in the training split; it has {', '.join(by_sequence)}")
     train = [indices for name, indices in by_sequence.items() if name not in held_out]
     if not train:
         raise InputError("data.validation: holding out these sequences leaves none to train on; use validation: block")

@@ -95,12 +95,19 @@ def test_a_single_sequence_gives_a_block():
     assert val.tolist() == list(range(900, 1000))
 
 
-@pytest.mark.parametrize("validation", ["auto", "sequences", "block"])
+@pytest.mark.parametrize("validation", ["auto", "sequences"])
 def test_sequences_are_held_out_by_name(validation):
     names = ["a"] * 3 + ["b"] * 2 + ["c"] * 4
     train, val = hold_out(frames_of(names), validation, sequences=["c", "a"])
     assert train.tolist() == [3, 4]
     assert val.tolist() == [0, 1, 2, 5, 6, 7, 8]
+
+
+def test_blocks_are_the_ends_of_named_sequences_only():
+    names = ["a"] * 6 + ["b"] * 6 + ["c"] * 3
+    train, val = hold_out(frames_of(names), "block", fraction=1 / 3, gap=1, sequences=["b", "c"])
+    assert train.tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 8, 12]
+    assert val.tolist() == [10, 11, 14]
 
 
 @pytest.mark.parametrize(

@@ -28,11 +28,11 @@ def tiny(gis: str = "gis", **kwargs) -> LitMambaLoc:
         image_size=SIZE, gis=gis, **kwargs,
     )  # fmt: skip
     with torch.no_grad():
-        for network in (system.network.position_head, system.network.orientation_head):
+        for network in (system.network.head.position, system.network.head.rotation):
             network[0].weight.mul_(5)
             network[2].weight.mul_(5)  # so that images differ visibly in their poses, of both signs of w
             network[2].bias.zero_()
-    system.network.position_scale.fit(torch.tensor([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0]]))
+    system.network.head.position_scale.fit(torch.tensor([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0]]))
     return system
 
 
@@ -148,7 +148,7 @@ def test_a_file_out_of_tolerance_is_not_left_behind(quick_write, tmp_path, toler
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("branch", ["position_head", "orientation_head"])
+@pytest.mark.parametrize("branch", ["position", "rotation"])
 def test_a_file_of_other_weights_is_found_out(quick_write, tmp_path, branch):
     system = tiny()
     with torch.no_grad():
@@ -160,7 +160,7 @@ def test_a_file_of_other_weights_is_found_out(quick_write, tmp_path, branch):
 def test_a_diverged_network_is_found_out(quick_write, tmp_path):
     system = tiny()
     with torch.no_grad():
-        system.network.position_head[2].bias.fill_(np.nan)
+        system.network.head.position[2].bias.fill_(np.nan)
     refused(system, tmp_path / "model.onnx", "differs from PyTorch")
 
 

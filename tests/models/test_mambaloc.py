@@ -72,7 +72,7 @@ def count(module: torch.nn.Module) -> int:
 
 @pytest.fixture(scope="module")
 def full_size() -> dict[str, MambaLoc]:
-    return {mode: MambaLoc(gis=mode) for mode in ("none", "classical", "gis")}
+    return {mode: LitMambaLoc(gis=mode).network for mode in ("none", "classical", "gis")}
 
 
 def test_shipped_parameters(full_size):
@@ -132,7 +132,8 @@ def test_images_of_another_size_are_refused():
 def test_branches_are_apart(branch, block):
     network = small().network.eval()
     before = network(images(2, 3, 64, 64))
-    for parameter in getattr(network, f"{branch}_{block}").parameters():
+    name = f"{branch}_{block}" if block != "head" else f"head.{'position' if branch == 'position' else 'rotation'}"
+    for parameter in network.get_submodule(name).parameters():
         parameter.mul_(1.5)
     after = network(images(2, 3, 64, 64))
     changed = {
@@ -151,8 +152,8 @@ def test_gis_is_the_network_without_it_and_a_block_before_each_head():
     for actual, expected in zip(with_gis.features(images(2, 3, 64, 64)), selected, strict=True):
         assert_close(actual, expected, rtol=1e-5, atol=1e-7)
     prediction = with_gis(images(2, 3, 64, 64))
-    assert_close(prediction.position_m, with_gis.position_head(selected[0]), rtol=1e-5, atol=1e-6)
-    assert_close(prediction.quaternion, with_gis.orientation_head(selected[1]), rtol=1e-5, atol=1e-6)
+    assert_close(prediction.position_m, with_gis.head.position(selected[0]), rtol=1e-5, atol=1e-6)
+    assert_close(prediction.quaternion, with_gis.head.rotation(selected[1]), rtol=1e-5, atol=1e-6)
 
 
 def test_options_reach_the_blocks():
@@ -226,7 +227,7 @@ def test_position_statistics_are_taken_from_training_and_saved(tmp_path, normali
     run = trainer(tmp_path)
     run.fit(system, datamodule=scene)
     run.save_checkpoint(tmp_path / "last.ckpt")
-    mean_m = load(tmp_path / "last.ckpt").network.position_scale.mean_m
+    mean_m = load(tmp_path / "last.ckpt").network.head.position_scale.mean_m
     assert_close(mean_m, scene.train_position_m.mean(0) if normalise else torch.zeros(3))
 
 
