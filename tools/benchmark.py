@@ -1,12 +1,11 @@
-"""Measure the library: python tools/benchmark.py loading|sizes [--dataset 7scenes --root FOLDER --scene NAME]."""
+"""Measure the library: python tools/benchmark.py sizes | latency [SYSTEM ...] | loading [--scene NAME ...]."""
 
 import argparse
-from statistics import median
 
-from mambaloc import create_model, provenance
-from mambaloc.benchmark import measure_loading, published_accounting
+from mambaloc import benchmark, list_models, provenance
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
+from mambaloc.models.registry import model_class
 
 
 @exits_cleanly
@@ -14,22 +13,26 @@ def main() -> None:
     """Measure and print."""
     quieten()
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("loading", "sizes"))
-    parser.add_argument("--dataset", default="embedded")
-    parser.add_argument("--root")
-    parser.add_argument("--scene", default="heads")
+    what = parser.add_subparsers(dest="what", required=True)
+    what.add_parser("sizes", help="parameters of every system beside the paper's")
+    latency = what.add_parser("latency", help="forward and training-step times with GIS, as ratios to without")
+    latency.add_argument("systems", nargs="*", help="names; all of them unless given")
+    latency.add_argument("--image-size", type=int, default=224)
+    latency.add_argument("--repetitions", type=int, default=20)
+    latency.add_argument("--device", default="cpu", help="cpu or cuda")
+    loading = what.add_parser("loading", help="images per second from the cache and decoding every epoch")
+    for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
+        loading.add_argument(name, default=default)
     args = parser.parse_args()
+    machine = f"{provenance.device_name()}, commit {provenance.commit()}"
     if args.what == "sizes":
-        for gis in ("gis", "none"):
-            counts = published_accounting(create_model("mambaloc", gis=gis).network)
-            print(f"mambaloc, gis: {gis}")
-            for item, count in counts.items():
-                print(f"  {item:28}{count:>12,}  {count * 4 / 2**20:8.2f} MiB")
-        return
-    rates = measure_loading(PoseDataModule(args.dataset, args.root, args.scene))
-    for name, figures in (("decode-once cache", rates.cached), ("decode every epoch", rates.decoded)):
-        print(f"{name:20}{median(figures):8.0f} images/s on one core  ({min(figures):.0f} to {max(figures):.0f})")
-    print(f"ratio {rates.ratio:.1f}   {provenance.device_name()}, commit {provenance.commit()}")
+        benchmark.print_sizes(benchmark.size_table())
+    elif args.what == "loading":
+        benchmark.print_loading(benchmark.measure_loading(PoseDataModule(args.dataset, args.root, args.scene)), machine)
+    else:
+        systems = [model_class(name).registry_name for name in args.systems or list_models()]
+        found = benchmark.measure_latency(systems, args.image_size, (1, 8), args.repetitions, args.device)
+        benchmark.print_latencies(found, args.image_size, machine)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,20 @@
 """Measurements of the library itself: each a ratio taken in one run."""
 
+from mambaloc.benchmark.latency import Latency, forward_flops, measure_latency
 from mambaloc.benchmark.loading import LoadingRates, measure_loading
-from mambaloc.benchmark.sizes import published_accounting
+from mambaloc.benchmark.report import print_latencies, print_loading, print_sizes
+from mambaloc.benchmark.sizes import Size, size_of, size_table
 
-__all__ = ["LoadingRates", "measure_loading", "published_accounting"]
+__all__ = [
+    "Latency",
+    "LoadingRates",
+    "Size",
+    "forward_flops",
+    "measure_latency",
+    "measure_loading",
+    "print_latencies",
+    "print_loading",
+    "print_sizes",
+    "size_of",
+    "size_table",
+]

@@ -1,32 +1,104 @@
-"""Parameters as the paper counts them: what it publishes beside what is shipped."""
+"""Parameters of every system as the paper counts them: what it publishes beside what is shipped."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import timm
 import torch
+from torch import nn
 
-from mambaloc.models.mambaloc import MambaLoc
+from mambaloc.models import create_model, list_models
+from mambaloc.models.student import Student
+from mambaloc.models.transposenet import TransPoseNet
+
+PAPER_MIB: dict[tuple[str, str], float] = {
+    ("posenet", "none"): 85.26,
+    ("posenet", "gis"): 186.12,
+    ("lstm_posenet", "none"): 89.6,
+    ("lstm_posenet", "gis"): 115.44,
+    ("atloc", "none"): 93.3,
+    ("atloc", "gis"): 118.69,
+    ("transposenet", "none"): 40.57,
+    ("transposenet", "gis"): 42.24,
+    ("mambaloc", "gis"): 42.24,
+    ("student", "none"): 22.69,
+}
+"""The paper's size table, by system and GIS; it prints MiB as "Mb"."""
+
+UNEXPLAINED = {("lstm_posenet", "none"): "90.01 MiB by its description, and with GIS the paper agrees"}
+"""Figures of the paper that no reading of it gives."""
 
 _PUBLISHED_TABLES = 3 * 60 * 128
 
 
-def published_accounting(network: MambaLoc) -> dict[str, int]:
-    """Count a network's parameters, item by item, as the paper's model has them.
+@dataclass(frozen=True)
+class Size:
+    """Parameters of a system.
+
+    Args:
+        system: its name.
+        gis: its GIS.
+        shipped: parameters that it has here.
+        replaced: what the published model has besides, or instead, item by item.
+    """
+
+    system: str
+    gis: str
+    shipped: int
+    replaced: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def published(self) -> int:
+        """Parameters of the published model."""
+        return self.shipped + sum(self.replaced.values())
+
+    @property
+    def paper_mib(self) -> float | None:
+        """What the paper prints, where it does."""
+        return PAPER_MIB.get((self.system, self.gis))
+
+
+def size_table() -> list[Size]:
+    """Count every registered system with and without GIS, as its defaults build it."""
+    return [size_of(name, gis) for name in list_models() for gis in ("none", "gis")]
+
+
+def size_of(name: str, gis: str) -> Size:
+    """Count a system."""
+    with torch.random.fork_rng():
+        network = create_model(name, gis=gis).network
+    return Size(name, gis, _count(network), published_items(network))
+
+
+def published_items(network: nn.Module) -> dict[str, int]:
+    """What a published model has besides ours, item by item; negative for what it has instead.
 
     The published TransPoseNet and MambaLoc carry the whole EfficientNet-B0, of which the last stages, last
-    convolution and classifier never touch the output, and three position tables of 60 x 128 whatever the image.
-
-    Returns:
-        ``shipped``, then what the published model adds and replaces, and their sum ``published``.
+    convolution and classifier never touch the output, and three position tables of 60 x 128 whatever the image. The
+    student carries its backbone's classifier.
     """
-    with torch.device("meta"):
-        whole = timm.create_model(network.backbone.name)
-    tables = [p for e in (network.position_encoder, network.orientation_encoder) for p in e.positions.parameters()]
-    items = {
-        "shipped": sum(p.numel() for p in network.parameters()),
-        "dead backbone": sum(p.numel() for p in whole.parameters())
-        - sum(p.numel() for p in network.backbone.parameters()),
-        "our position tables": -sum(table.numel() for table in tables),
+    if isinstance(network, Student):
+        return {"unused classifier": _whole(network.backbone.name) - _count(network.backbone)}
+    if not isinstance(network, TransPoseNet):
+        return {}
+    encoders = (network.position_encoder, network.orientation_encoder)
+    return {
+        "dead backbone": _whole(network.backbone.name) - _count(network.backbone),
+        "our position tables": -sum(_count(encoder.positions) for encoder in encoders),
         "published position tables": _PUBLISHED_TABLES,
     }
-    return {**items, "published": sum(items.values())}
+
+
+def mib(parameters: int) -> float:
+    """Size in float32."""
+    return parameters * 4 / 2**20
+
+
+def _count(module: nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def _whole(backbone: str) -> int:
+    with torch.device("meta"):
+        return _count(timm.create_model(backbone))

@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mambaloc.data.frames import Frames
-from mambaloc.data.splits import hold_out, subsample
+from mambaloc.data.splits import clips_of, hold_out, subsample
 from mambaloc.errors import InputError
 
 briefly = settings(max_examples=60, deadline=None)
@@ -165,3 +165,36 @@ def test_subsampling_out_of_range_is_refused(options):
     ((name, value),) = options.items()
     with pytest.raises(InputError, match=f"data.{name} {value}: "):
         subsample(frames_of(["a"] * 10), **options)
+
+
+# --- clips -----------------------------------------------------------------------------------------------------------
+
+
+def test_clips_hold_their_frame_and_never_cross_a_border():
+    names = ["a"] * 30 + ["b"] * 25
+    clips = clips_of(frames_of(names), length=3, skip=10)
+    assert clips.shape == (55, 3)
+    assert (np.array(names)[clips] == np.array(names)[clips[:, :1]]).all()
+    assert (clips == np.arange(55)[:, None]).any(axis=1).all()
+    assert (np.diff(clips, axis=1) > 0).all()
+
+
+def test_clips_by_hand():
+    clips = clips_of(frames_of(["a"] * 25), length=3, skip=10)
+    assert clips[12].tolist() == [2, 12, 22]  # the middle fits
+    assert clips[3].tolist() == [3, 13, 23]  # no room before: the first
+    assert clips[22].tolist() == [2, 12, 22]  # none after: the last
+    assert clips_of(frames_of(["a"] * 4), length=3, skip=10).tolist() == [[0, 1, 2], [0, 1, 2], [1, 2, 3], [1, 2, 3]]
+
+
+def test_sequences_shorter_than_a_clip_have_none():
+    assert clips_of(frames_of(["a", "b", "b", "b"]), length=3, skip=1).tolist() == [[1, 2, 3]] * 3
+
+
+@pytest.mark.parametrize(
+    ("length", "skip", "message"),
+    [(3, 1, "longest of 2 training sequences has 2 frames"), (1, 1, "clip_length 1"), (2, 0, "clip_skip 0")],
+)
+def test_clips_that_cannot_be(length, skip, message):
+    with pytest.raises(InputError, match=message):
+        clips_of(frames_of("aabb"), length, skip)

@@ -152,7 +152,9 @@ def test_a_file_out_of_tolerance_is_not_left_behind(quick_write, tmp_path, toler
 def test_a_file_of_other_weights_is_found_out(quick_write, tmp_path, branch):
     system = tiny()
     with torch.no_grad():
-        getattr(system.network, branch)[2].bias.add_(torch.tensor([0.0, 1.0, 0.0, 0.0])[: 3 if "pos" in branch else 4])
+        getattr(system.network.head, branch)[2].bias.add_(
+            torch.tensor([0.0, 1.0, 0.0, 0.0])[: 3 if "pos" in branch else 4]
+        )
     refused(system, tmp_path / "model.onnx", "differs from PyTorch")
     assert not list(tmp_path.iterdir())
 

@@ -1,0 +1,74 @@
+"""Measurements as tables in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import median
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from mambaloc.benchmark.latency import Latency, forward_flops
+from mambaloc.benchmark.loading import LoadingRates
+from mambaloc.benchmark.sizes import UNEXPLAINED, Size, mib
+
+
+def print_sizes(sizes: Sequence[Size]) -> None:
+    """Print a row a system and GIS: shipped, published accounting, and the paper's figure."""
+    table = _table("Parameters", "system", "gis", "shipped", "MiB", "published", "MiB", "paper MiB")
+    notes = []
+    for size in sizes:
+        paper = "" if size.paper_mib is None else f"{size.paper_mib:.2f}"
+        if note := UNEXPLAINED.get((size.system, size.gis)):
+            notes.append(f"* {size.system}, gis {size.gis}: the paper's {paper} is unexplained; {note}")
+            paper += "*"
+        cells = (f"{size.shipped:,}", f"{mib(size.shipped):.2f}", f"{size.published:,}", f"{mib(size.published):.2f}")
+        table.add_row(size.system, size.gis, *cells, paper)
+    console = Console(highlight=False)
+    console.print(table)
+    for line in notes + _replaced(sizes):
+        console.print(line, soft_wrap=True)
+
+
+def _replaced(sizes: Sequence[Size]) -> list[str]:
+    """What makes the difference of shipped and published, a line for all systems of the same items."""
+    systems: dict[tuple[tuple[str, int], ...], list[str]] = {}
+    for size in sizes:
+        if size.replaced:
+            systems.setdefault(tuple(size.replaced.items()), []).append(size.system)
+    return [
+        f"{', '.join(dict.fromkeys(names))}: " + ", ".join(f"{item} {count:+,}" for item, count in items)
+        for items, names in systems.items()
+    ]
+
+
+def print_latencies(latencies: Sequence[Latency], image_size: int, machine: str) -> None:
+    """Print a row a system, measure and batch: medians, the ratio, its spread; then operations."""
+    title = f"Seconds without and with GIS, {image_size} px, {machine}"
+    table = _table(title, "system", "what", "batch", "without ms", "with ms", "ratio", "± IQR")
+    for each in latencies:
+        times = (f"{median(s) * 1000:.1f}" for s in (each.without_s, each.with_s))
+        table.add_row(each.system, each.what, str(each.batch), *times, f"{each.ratio:.3f}", f"{each.spread:.3f}")
+    flops = _table("Forward pass of one image", "system", "GFLOP without", "GFLOP with", "ratio")
+    for name in dict.fromkeys(each.system for each in latencies):
+        without, with_gis = (forward_flops(name, gis, image_size) for gis in ("none", "gis"))
+        flops.add_row(name, f"{without / 1e9:.3f}", f"{with_gis / 1e9:.3f}", f"{with_gis / without:.3f}")
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(flops)
+
+
+def print_loading(rates: LoadingRates, machine: str) -> None:
+    """Print images per second, and their ratio."""
+    for name, figures in (("decode-once cache", rates.cached), ("decode every epoch", rates.decoded)):
+        print(f"{name:20}{median(figures):8.0f} images/s on one core  ({min(figures):.0f} to {max(figures):.0f})")
+    print(f"ratio {rates.ratio:.1f}   {machine}")
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for column in columns:
+        text = column in ("system", "gis", "what")
+        table.add_column(column, justify="left" if text else "right", no_wrap=True)
+    return table
