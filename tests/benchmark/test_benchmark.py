@@ -1,6 +1,6 @@
 import pytest
 
-from mambaloc.benchmark import LoadingRates, measure_loading, size_of
+from mambaloc.benchmark import Latency, LoadingRates, forward_flops, measure_latency, measure_loading, size_of
 from mambaloc.benchmark.sizes import UNEXPLAINED, mib
 from mambaloc.data import PoseDataModule
 
@@ -14,6 +14,30 @@ def test_loading_is_timed_both_ways(scenes):
 
 def test_ratio_is_of_medians():
     assert LoadingRates(cached=[10.0, 30.0, 1000.0], decoded=[1.0, 3.0, 4.0]).ratio == 10
+
+
+def test_latency_is_timed_in_turns():
+    found = measure_latency(["student", "mapnet"], image_size=64, batches=(1, 2), repetitions=4)
+    assert [(each.system, each.batch, each.what) for each in found] == [
+        (system, batch, what)
+        for system in ("student", "mapnet")
+        for batch in (1, 2)
+        for what in ("forward", "training step")
+    ]
+    assert all(len(each.without_s) == len(each.with_s) == 4 for each in found)
+    assert all(min(each.without_s + each.with_s) > 0 for each in found)
+
+
+def test_latency_by_hand():
+    times = Latency("student", "forward", 1, without_s=[1.0, 2.0, 4.0], with_s=[1.5, 2.0, 8.0])
+    assert times.ratio == 1
+    assert times.spread == pytest.approx(1.0)  # of the ratios 1.5, 1, 2
+
+
+def test_operations_of_gis_are_those_of_its_products():
+    with_gis, without = (forward_flops("student", gis, 64) for gis in ("gis", "none"))
+    # A branch of width D multiplies by in_proj (both tokens' halves but one), x_proj, dt_proj and out_proj.
+    assert 0 < with_gis - without < 2 * 2 * 2 * 1_694_720
 
 
 @pytest.mark.parametrize(("name", "gis", "published"), [
