@@ -126,15 +126,17 @@ def _write(deployed: nn.Module, system: LitPoseRegressor, path: Path) -> None:
 @contextlib.contextmanager
 def _quiet():  # type: ignore[no-untyped-def]
     """The exporter reports its steps on stdout and warns of its own internals."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             yield
     finally:
-        logger.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _largest_position_m(deployed: nn.Module) -> float:

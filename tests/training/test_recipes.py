@@ -41,7 +41,7 @@ def stand_in(recipe: Path, scenes: Path, cambridge: Path) -> list[str]:
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
 def test_recipe_runs(recipe, scenes, cambridge, tmp_path):
     options = [*stand_in(recipe, scenes, cambridge), "--trainer.fast_dev_run", "1", "--data.batch_size", "2"]
-    options += ["--data.validation", "sequences"]
+    options += ["--data.validation", "sequences", "--data.val_sequences", "null"]
     for subcommand in ("fit", "validate", "test", "predict"):
         cli = main([subcommand, str(recipe), *options, "--trainer.default_root_dir", str(tmp_path)])
         assert cli.trainer.state.finished
