@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.flop_counter import FlopCounterMode
 
+from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, transform
 from mambaloc.models import LitPoseRegressor, create_model
 from mambaloc.types import Pose, PoseBatch
@@ -56,7 +57,15 @@ def measure_latency(
     repetitions: int = 20,
     device: str = "cpu",
 ) -> list[Latency]:
-    """Time forward passes and training steps, without and with GIS in turns, so that both meet the same machine."""
+    """Time forward passes and training steps, without and with GIS in turns, so that both meet the same machine.
+
+    Raises:
+        InputError: for a device that is not there, or too few repetitions to tell a spread.
+    """
+    if repetitions < 4:
+        raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError(f"--device {device}: no CUDA device is visible here; use cpu")
     cells = [(name, batch) for name in systems for batch in batches]
     console = Console(stderr=True)
     found: list[Latency] = []

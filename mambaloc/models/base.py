@@ -243,13 +243,17 @@ def start_from(network: nn.Module, path: str | Path) -> None:
         InputError: where there is no such checkpoint, or its network is another one.
     """
     prefix = "network."
-    state = read_checkpoint(path)["state_dict"]
+    try:
+        state = read_checkpoint(path)["state_dict"]
+    except InputError as error:
+        raise InputError(f"model.warm_start: {error}; train it first, or set it to null") from None
     try:
         network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise InputError(
-            f"warm_start {path}: its network is another one ({reason}); train that with this recipe's model arguments"
+            f"model.warm_start: {path}: its network is another one ({reason}); "
+            "train that with this recipe's model arguments"
         ) from None
 
 

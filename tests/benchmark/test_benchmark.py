@@ -1,8 +1,10 @@
 import pytest
+import torch
 
 from mambaloc.benchmark import Latency, LoadingRates, forward_flops, measure_latency, measure_loading, size_of
 from mambaloc.benchmark.sizes import UNEXPLAINED, mib
 from mambaloc.data import PoseDataModule
+from mambaloc.errors import InputError
 
 
 def test_loading_is_timed_both_ways(scenes):
@@ -26,6 +28,15 @@ def test_latency_is_timed_in_turns():
     ]
     assert all(len(each.without_s) == len(each.with_s) == 4 for each in found)
     assert all(min(each.without_s + each.with_s) > 0 for each in found)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"), [({"repetitions": 3}, "--repetitions 3"), ({"device": "cuda:9"}, "cuda")]
+)
+def test_what_latency_cannot_measure(kwargs, message, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match=message):
+        measure_latency(["student"], **kwargs)
 
 
 def test_latency_by_hand():
