@@ -62,7 +62,8 @@ def test_stopped_run_leaves_a_checkpoint_that_resumes_exactly(how, tiny_recipe, 
     stopped, whole = tmp_path / "stopped", tmp_path / "whole"
     command = [sys.executable, REPOSITORY / "tools/train.py", tiny_recipe]
     options = ["--trainer.max_epochs", "500", "--trainer.default_root_dir", stopped]
-    process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE)
+    heed = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731  a shell's background jobs ignore it
+    process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, preexec_fn=heed)
     last = stopped / "checkpoints/last.ckpt"
     deadline = time.monotonic() + 120
     while not last.exists() and time.monotonic() < deadline and process.poll() is None:
