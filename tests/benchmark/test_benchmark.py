@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from mambaloc.benchmark import Latency, LoadingRates, forward_flops, measure_latency, measure_loading, size_of
+from mambaloc.benchmark.report import print_latencies, print_sizes
 from mambaloc.benchmark.sizes import UNEXPLAINED, mib
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
@@ -81,3 +82,16 @@ def test_the_one_unexplained_base_is_no_rounding():
     size = size_of(name, gis)
     assert mib(size.published) == pytest.approx(90.01, abs=0.005)
     assert abs(mib(size.published) - size.paper_mib) > 0.3
+
+
+def test_tables_say_what_was_measured(capsys):
+    print_sizes([size_of("lstm_posenet", "none"), size_of("student", "none")])
+    said = capsys.readouterr().out
+    assert "23,594,822" in said
+    assert "the paper's 89.60 is unexplained" in said
+    assert "student: unused classifier +1,281,000" in said
+    print_latencies([Latency("student", "forward", 8, [0.1] * 4, [0.103] * 4)], 64, "a machine")
+    said = capsys.readouterr().out
+    assert "student" in said
+    assert "1.030" in said
+    assert "a machine" in said
