@@ -11,7 +11,8 @@ from rich.table import Table
 
 from mambaloc.benchmark.latency import Latency, forward_flops
 from mambaloc.benchmark.loading import LoadingRates
-from mambaloc.benchmark.sizes import UNEXPLAINED, Size, mib
+from mambaloc.benchmark.sizes import UNEXPLAINED, Size
+from mambaloc.models.base import mib
 
 
 def print_sizes(sizes: Sequence[Size]) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from mambaloc.models import create_model, list_models
+from mambaloc.models.base import parameter_count
 from mambaloc.models.student import Student
 from mambaloc.models.transposenet import TransPoseNet
 
@@ -68,7 +69,7 @@ def size_of(name: str, gis: str) -> Size:
     """Count a system."""
     with torch.random.fork_rng():
         network = create_model(name, gis=gis).network
-    return Size(name, gis, _count(network), published_items(network))
+    return Size(name, gis, parameter_count(network), published_items(network))
 
 
 def published_items(network: nn.Module) -> dict[str, int]:
@@ -79,26 +80,17 @@ def published_items(network: nn.Module) -> dict[str, int]:
     student carries its backbone's classifier.
     """
     if isinstance(network, Student):
-        return {"unused classifier": _whole(network.backbone.name) - _count(network.backbone)}
+        return {"unused classifier": _whole(network.backbone.name) - parameter_count(network.backbone)}
     if not isinstance(network, TransPoseNet):
         return {}
     encoders = (network.position_encoder, network.orientation_encoder)
     return {
-        "dead backbone": _whole(network.backbone.name) - _count(network.backbone),
-        "our position tables": -sum(_count(encoder.positions) for encoder in encoders),
+        "dead backbone": _whole(network.backbone.name) - parameter_count(network.backbone),
+        "our position tables": -sum(parameter_count(encoder.positions) for encoder in encoders),
         "published position tables": _PUBLISHED_TABLES,
     }
 
 
-def mib(parameters: int) -> float:
-    """Size in float32."""
-    return parameters * 4 / 2**20
-
-
-def _count(module: nn.Module) -> int:
-    return sum(p.numel() for p in module.parameters())
-
-
 def _whole(backbone: str) -> int:
     with torch.device("meta"):
-        return _count(timm.create_model(backbone))
+        return parameter_count(timm.create_model(backbone))

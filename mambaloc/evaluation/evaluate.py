@@ -18,7 +18,7 @@ from mambaloc.evaluation.references import median_training_pose
 from mambaloc.evaluation.trajectories import write_csv, write_tum
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models import LitPoseRegressor, load
-from mambaloc.models.base import parameter_mib, read_checkpoint
+from mambaloc.models.base import mib, parameter_count, read_checkpoint
 from mambaloc.viz import draw_trajectory
 
 
@@ -118,7 +118,7 @@ def _describe_model(system: LitPoseRegressor) -> dict[str, Any]:
     return {
         "name": system.registry_name,
         "parameters": sum(p.numel() for p in system.network.parameters()),
-        "mib": round(parameter_mib(system.network), 3),
+        "mib": round(mib(parameter_count(system.network)), 3),
         "hyperparameters": dict(system.hparams),
     }
 

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from mambaloc.errors import InputError
 from mambaloc.geometry import log_from_quaternion
+from mambaloc.losses.weighted import weighed
 from mambaloc.types import PoseBatch, PosePrediction
 
 
@@ -32,8 +33,10 @@ class LogQuaternionWeights(nn.Module):
 
     def forward(self, prediction: PosePrediction, target: PoseBatch) -> Tensor:
         """Weigh the two mean distances; a scalar."""
-        position_m, log_quaternion = _residuals(prediction, target)
-        return _weigh(position_m, self.s_position, log_quaternion, self.s_rotation)
+        return self._absolute(*_residuals(prediction, target))
+
+    def _absolute(self, position_m: Tensor, log_quaternion: Tensor) -> Tensor:
+        return weighed(_l1(position_m), self.s_position) + weighed(_l1(log_quaternion), self.s_rotation)
 
 
 class RelativeLogQuaternionWeights(LogQuaternionWeights):
@@ -66,7 +69,8 @@ class RelativeLogQuaternionWeights(LogQuaternionWeights):
         Raises:
             InputError: for single frames while training.
         """
-        absolute = super().forward(prediction, target)
+        residuals = _residuals(prediction, target)
+        absolute = self._absolute(*residuals)
         if target.clip_length == 1:
             if self.training:
                 raise InputError(
@@ -75,11 +79,9 @@ class RelativeLogQuaternionWeights(LogQuaternionWeights):
                 )
             return absolute
         # Differences are linear, so the residual of a relative pose is the difference of two residuals.
-        position_m, log_quaternion = (
-            residual.unflatten(0, (-1, target.clip_length)).diff(dim=1).flatten(0, 1)
-            for residual in _residuals(prediction, target)
-        )
-        return absolute + _weigh(position_m, self.s_relative_position, log_quaternion, self.s_relative_rotation)
+        position, rotation = (_l1(each.unflatten(0, (-1, target.clip_length)).diff(dim=1)) for each in residuals)
+        relative = weighed(position, self.s_relative_position) + weighed(rotation, self.s_relative_rotation)
+        return absolute + relative
 
 
 def _residuals(prediction: PosePrediction, target: PoseBatch) -> tuple[Tensor, Tensor]:
@@ -95,6 +97,5 @@ def _residuals(prediction: PosePrediction, target: PoseBatch) -> tuple[Tensor, T
     )
 
 
-def _weigh(position: Tensor, s_position: Tensor, rotation: Tensor, s_rotation: Tensor) -> Tensor:
-    position_l1, rotation_l1 = position.abs().sum(-1).mean(), rotation.abs().sum(-1).mean()
-    return position_l1 * torch.exp(-s_position) + s_position + rotation_l1 * torch.exp(-s_rotation) + s_rotation
+def _l1(residual: Tensor) -> Tensor:
+    return residual.abs().sum(-1).mean()

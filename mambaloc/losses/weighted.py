@@ -34,6 +34,11 @@ def pose_distances(
     return position_m.mean(), rotation.mean()
 
 
+def weighed(distance: Tensor, s: Tensor) -> Tensor:
+    """Weigh a distance by its learned log-variance (Kendall and Cipolla 2017)."""
+    return distance * torch.exp(-s) + s
+
+
 class LearnedWeights(nn.Module):
     """Learned homoscedastic weights (Kendall and Cipolla 2017; MambaLoc, its equation of the loss).
 
@@ -62,12 +67,7 @@ class LearnedWeights(nn.Module):
     def forward(self, prediction: PosePrediction, target: PoseBatch) -> Tensor:
         """Weigh the two mean distances; a scalar."""
         position_m, rotation = pose_distances(prediction, target, self.norm, self.nearest_sign)
-        return (
-            position_m * torch.exp(-self.s_position)
-            + self.s_position
-            + rotation * torch.exp(-self.s_rotation)
-            + self.s_rotation
-        )
+        return weighed(position_m, self.s_position) + weighed(rotation, self.s_rotation)
 
 
 class FixedWeights(nn.Module):

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, build_gis
-from mambaloc.types import PosePrediction
+from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, PoseNetwork, build_gis
 
 
 class FeatureAttention(nn.Module):
@@ -36,7 +35,7 @@ class FeatureAttention(nn.Module):
         return feats_BD + self.out(attended_BE)
 
 
-class AtLoc(nn.Module):
+class AtLoc(PoseNetwork):
     """A pooled backbone, one wide layer, attention on it, and linear heads for position and log-quaternion.
 
     With GIS each half of the attended feature has its own, as the paper's size table says, and both heads read both.
@@ -74,10 +73,6 @@ class AtLoc(nn.Module):
         first_BD, second_BD = self.dropout(self.attention(self.fc(self.backbone(image)))).chunk(2, dim=-1)
         feats_BD = torch.cat((self.first_gis(first_BD), self.second_gis(second_BD)), dim=-1)
         return feats_BD, feats_BD
-
-    def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
-        return self.head(*self.features(image))
 
 
 @register_model("atloc")

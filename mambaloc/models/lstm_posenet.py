@@ -9,13 +9,12 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, Rotation, build_gis
-from mambaloc.types import PosePrediction
+from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, PoseNetwork, Rotation, build_gis
 
 _ROWS, _COLUMNS = 32, 64
 
 
-class LSTMPoseNet(nn.Module):
+class LSTMPoseNet(PoseNetwork):
     """A 2048-wide feature as a 32 x 64 matrix; four LSTMs read it down, up, right and left, from a zero state.
 
     Args:
@@ -56,10 +55,6 @@ class LSTMPoseNet(nn.Module):
         _, (horizontal_2BE, _) = self.right_and_left(matrix_BRC.mT)
         feats_BD = self.dropout(torch.cat((*vertical_2BE, *horizontal_2BE), dim=-1))
         return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
-
-    def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
-        return self.head(*self.features(image))
 
 
 @register_model("lstm_posenet")

@@ -11,19 +11,29 @@ from torchvision.models import GoogLeNet, GoogLeNet_Weights
 from mambaloc.errors import InputError
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Discretisation, GISMode, ImageBackbone, PooledBackbone, PoseHead, build_gis
+from mambaloc.nn import (
+    Discretisation,
+    GISMode,
+    ImageBackbone,
+    PooledBackbone,
+    PoseHead,
+    PoseNetwork,
+    Rotation,
+    build_gis,
+)
 from mambaloc.types import PosePrediction
 
 Variant = Literal["timm", "googlenet"]
 
 
-class PoseNet(nn.Module):
+class PoseNet(PoseNetwork):
     """A pooled backbone, one wide layer, and a linear head each for position and rotation.
 
     Args:
         backbone: one feature per image.
         width: of the fully connected layer and of GIS.
         dropout: before the heads.
+        rotation: ``quaternion`` or ``log_quaternion``.
         gis: ``gis``, ``classical`` or ``none``.
         discretisation: of the state space: ``euler`` or ``zoh``.
 
@@ -36,6 +46,7 @@ class PoseNet(nn.Module):
         backbone: PooledBackbone | GoogLeNetBackbone,
         width: int = 2048,
         dropout: float = 0.5,
+        rotation: Rotation = "quaternion",
         gis: GISMode = "none",
         discretisation: Discretisation = "euler",
     ) -> None:
@@ -44,7 +55,7 @@ class PoseNet(nn.Module):
         self.fc = nn.Sequential(nn.Linear(backbone.width, width), nn.ReLU(), nn.Dropout(dropout))
         self.position_gis = build_gis(gis, width, discretisation)
         self.orientation_gis = build_gis(gis, width, discretisation)
-        self.head = PoseHead(width)
+        self.head = PoseHead(width, rotation)
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return both branches' global features, what their heads read; (B, width) each."""
@@ -54,10 +65,6 @@ class PoseNet(nn.Module):
         """Turn the backbone's feature into both branches' features; (B, width) each."""
         feats_BD = self.fc(feats_BD)
         return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
-
-    def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
-        return self.head(*self.features(image))
 
 
 class GoogLeNetBackbone(ImageBackbone):

@@ -8,11 +8,10 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, build_gis
-from mambaloc.types import PosePrediction
+from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, PoseNetwork, build_gis
 
 
-class Student(nn.Module):
+class Student(PoseNetwork):
     """A pooled backbone, one layer, and a linear head each for position and rotation.
 
     Args:
@@ -45,10 +44,6 @@ class Student(nn.Module):
         """Return both branches' global features, what their heads read; (B, width) each."""
         feats_BD = self.fc(self.backbone(image))
         return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
-
-    def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
-        return self.head(*self.features(image))
 
 
 @register_model("student")

@@ -16,8 +16,7 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Backbone, Discretisation, GISMode, PoseHead, build_gis
-from mambaloc.types import PosePrediction
+from mambaloc.nn import Backbone, Discretisation, GISMode, PoseHead, PoseNetwork, build_gis
 
 
 class TransformerBottleneck(nn.Module):
@@ -88,7 +87,7 @@ class ShuffleAttention(nn.Module):
         return weighed.unflatten(1, (2, -1)).transpose(1, 2).flatten(1, 2)
 
 
-class TransBoNet(nn.Module):
+class TransBoNet(PoseNetwork):
     """A backbone to stride 16, three transformer bottlenecks at stride 32, shuffle attention, one wide layer, two MLPs.
 
     Args:
@@ -142,10 +141,6 @@ class TransBoNet(nn.Module):
         (stride16_BCHW,) = self.backbone(image)
         feats_BD = self.fc(self.shuffle_attention(self.stage(stride16_BCHW)).mean((-2, -1)))
         return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
-
-    def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
-        return self.head(*self.features(image))
 
 
 @register_model("transbonet")

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Backbone, Discretisation, GISMode, PoseHead, TokenEncoder, build_gis
-from mambaloc.types import PosePrediction
+from mambaloc.nn import Backbone, Discretisation, GISMode, PoseHead, PoseNetwork, TokenEncoder, build_gis
 
 
-class TransPoseNet(nn.Module):
+class TransPoseNet(PoseNetwork):
     """Position is read at stride 16, orientation at stride 8, each by a transformer that attends within its map.
 
     Args:
@@ -73,10 +72,6 @@ class TransPoseNet(nn.Module):
         position_BD = self.position_gis(self.position_encoder(stride16_BCHW))
         orientation_BD = self.orientation_gis(self.orientation_encoder(stride8_BCHW))
         return position_BD, orientation_BD
-
-    def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
-        return self.head(*self.features(image))
 
 
 @register_model("transposenet")

@@ -3,7 +3,7 @@
 from mambaloc.nn.backbone import Backbone, ImageBackbone, PooledBackbone
 from mambaloc.nn.encoder import TokenEncoder
 from mambaloc.nn.gis import GISMode, GlobalInformationSelector, build_gis
-from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation
+from mambaloc.nn.heads import PoseHead, PoseNetwork, PositionScale, RegressionHead, Rotation
 from mambaloc.nn.ssm import Discretisation, MambaMixer, selective_scan
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "MambaMixer",
     "PooledBackbone",
     "PoseHead",
+    "PoseNetwork",
     "PositionScale",
     "RegressionHead",
     "Rotation",

@@ -1,4 +1,4 @@
-"""What turns global features into poses: regression heads and the scene's position scale."""
+"""What turns global features into poses: regression heads, the scene's position scale, and the networks they end."""
 
 from __future__ import annotations
 
@@ -89,3 +89,21 @@ class PoseHead(nn.Module):
         if self.is_log:
             return PosePrediction(position_m, quaternion_from_log(rotation), log_quaternion=rotation)
         return PosePrediction(position_m, rotation)
+
+
+class PoseNetwork(nn.Module):
+    """Base of every network: a global feature for each branch, and the head that reads them.
+
+    Shape:
+        (B, 3, H, W) in 0..1 -> :class:`~mambaloc.types.PosePrediction`.
+    """
+
+    head: PoseHead
+
+    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the position and the orientation branch's global features, (B, D) each."""
+        raise NotImplementedError
+
+    def forward(self, image: Tensor) -> PosePrediction:
+        """Localise images."""
+        return self.head(*self.features(image))

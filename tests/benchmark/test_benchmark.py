@@ -3,9 +3,10 @@ import torch
 
 from mambaloc.benchmark import Latency, LoadingRates, forward_flops, measure_latency, measure_loading, size_of
 from mambaloc.benchmark.report import print_latencies, print_sizes
-from mambaloc.benchmark.sizes import UNEXPLAINED, mib
+from mambaloc.benchmark.sizes import UNEXPLAINED
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
+from mambaloc.models.base import mib
 
 
 def test_loading_is_timed_both_ways(scenes):
@@ -69,6 +70,22 @@ def test_published_accounting_is_the_papers(name, gis, published):
     assert size.published == published
     if size.paper_mib is not None and (name, gis) not in UNEXPLAINED:
         assert mib(published) == pytest.approx(size.paper_mib, abs=0.05)
+
+
+@pytest.mark.parametrize(("name", "gis", "shipped"), [
+    ("posenet_learned", "none", 22_349_639),
+    ("posenet_geometric", "none", 22_349_639),
+    ("mapnet", "none", 22_347_590),
+    ("mapnet", "gis", 22_347_590 + 26_439_680),
+    ("transbonet", "none", 29_730_359),
+    ("transbonet", "gis", 29_730_359 + 26_439_680),
+    ("transposenet", "none", 6_186_855),
+    ("mambaloc", "gis", 6_624_615),
+    ("student", "none", 4_667_011),
+    ("student", "gis", 4_667_011 + 2 * 847_360),
+])  # fmt: skip
+def test_what_is_shipped(name, gis, shipped):
+    assert size_of(name, gis).shipped == shipped
 
 
 def test_what_the_published_models_carry():

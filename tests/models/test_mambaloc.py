@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from mambaloc.errors import InputError
 from mambaloc.models import load
-from mambaloc.models.base import parameter_mib
+from mambaloc.models.base import mib, parameter_count
 from mambaloc.models.mambaloc import LitMambaLoc, MambaLoc
 from mambaloc.nn import PositionScale
 from mambaloc.types import PoseBatch
@@ -81,7 +81,7 @@ def test_shipped_parameters(full_size):
         "classical": 6_624_615,
         "gis": 6_624_615,
     }
-    assert round(parameter_mib(full_size["gis"]), 1) == 25.3
+    assert round(mib(parameter_count(full_size["gis"])), 1) == 25.3
 
 
 @pytest.mark.parametrize(("mode", "published"), [("gis", 11_073_131), ("none", 10_635_371)])
@@ -104,7 +104,7 @@ def test_position_is_read_at_stride_16_and_orientation_at_stride_8(full_size):
 def test_frozen_parameters_are_not_counted():
     layer = torch.nn.Linear(2**9, 2**9, bias=False)
     layer.register_parameter("frozen", torch.nn.Parameter(torch.zeros(7), requires_grad=False))
-    assert parameter_mib(layer) == 1.0
+    assert mib(parameter_count(layer)) == 1.0
 
 
 # --- the network -----------------------------------------------------------------------------------------------------
