@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from datetime import datetime
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,8 +22,9 @@ from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, print_table
-from mambaloc.models import LitPoseRegressor
+from mambaloc.models import LitPoseRegressor, list_models
 from mambaloc.models.base import read_checkpoint
+from mambaloc.models.registry import model_class
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
 _SUBCOMMANDS = ("fit", "validate", "test", "predict")
@@ -35,6 +38,10 @@ class OneLineErrorParser(LightningArgumentParser):
         chatter = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
         lines = [line.strip() for line in str(message).splitlines()]
         said = " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(chatter))
+        if unknown := re.search(r"Expected a dot import path string: (\w+)", said):
+            systems = [model_class(name).__name__ for name in list_models()]
+            near = get_close_matches(unknown[1], systems, n=3, cutoff=0.4) or systems
+            raise InputError(f"model.class_path {unknown[1]}: there is none; did you mean {', '.join(near)}?")
         remedy = "; --help lists the options"  # a subcommand's parser reports to its parent, which reports again
         raise InputError(said.replace("typing.", "").removesuffix(remedy) + remedy)
 

@@ -69,6 +69,7 @@ def test_misplaced_recipe_is_refused(words, rule, tmp_path, monkeypatch):
     [
         (["--data.scene", "fire"], ["fire", "tools/download.py 7scenes fire"]),
         (["--model.gis", "both"], ["gis"]),
+        (["--model", "LitMambaLok"], ["LitMambaLok", "LitMambaLoc"]),
         (["--model.learning_rate", "1"], ["learning_rate"]),
         (["--model.backbone", "resnet10x"], ["resnet10x", "resnet10t"]),
         (["--ckpt_path", "nothing.ckpt"], ["nothing.ckpt"]),

@@ -13,7 +13,8 @@ from mambaloc.data.rendering.trajectories import smooth_trajectory
 REPOSITORY = Path(__file__).parents[2]
 
 RECIPES = sorted((REPOSITORY / "recipes").glob("*.yaml"))
-OVERLAYS = sorted(p for p in (REPOSITORY / "recipes/overlays").glob("*.yaml") if p.stem != "gpu")  # see test_gpu.py
+BLOCKS = REPOSITORY / "recipes/overlays/redkitchen_blocks.yaml"
+OVERLAYS = sorted({*BLOCKS.parent.glob("*.yaml")} - {BLOCKS, BLOCKS.with_name("gpu.yaml")})  # see test_gpu.py
 
 
 @pytest.fixture(scope="session")
@@ -61,3 +62,12 @@ def test_overlay_changes_what_it_says(overlay, tiny_recipe, tmp_path):
             values = values.get("init_args") or values
             assert {key: changed[section][key] for key in values} == values
             assert changed[section] != plain[section]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", [r for r in RECIPES if r.stem.endswith("_7scenes")], ids=lambda path: path.stem)
+def test_every_system_takes_the_equal_budget(recipe, scenes, cambridge, tmp_path):
+    options = [*stand_in(recipe, scenes, cambridge), "--trainer.default_root_dir", str(tmp_path)]
+    cli = main([str(recipe), str(BLOCKS), *options, "--trainer.fast_dev_run", "1", "--data.batch_size", "2"])
+    assert cli.model.hparams["backbone"] == "mobilenetv2_100"
+    assert cli.trainer.state.finished
