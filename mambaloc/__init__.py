@@ -2,7 +2,7 @@
 
 >>> import mambaloc
 >>> mambaloc.list_models()
-['mambaloc']
+['atloc', 'lstm_posenet', 'mambaloc', 'mapnet', 'posenet', 'posenet_geometric', 'posenet_learned', 'student', ...]
 >>> system = mambaloc.create_model("mambaloc", gis="gis")  # a LightningModule; .network is a plain nn.Module
 """
 

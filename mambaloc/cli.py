@@ -20,6 +20,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from mambaloc.callbacks import EarlyStopping, OnnxExport, PoseProgressBar, TrajectoryPlot, WallClock
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
+from mambaloc.distillation import LitDistillation
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, print_table
 from mambaloc.models import LitPoseRegressor, list_models
@@ -196,4 +197,4 @@ def main(argv: list[str] | None = None) -> RecipeCLI:
     )
 
 
-__all__ = ["RecipeCLI", "main", "recipe_arguments"]
+__all__ = ["LitDistillation", "RecipeCLI", "main", "recipe_arguments"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -170,6 +171,12 @@ class PoseDataModule(L.LightningDataModule):
     def predict_dataloader(self) -> DataLoader[PoseBatch]:
         """Test batches in order, for predictions without errors."""
         return self.test_dataloader()
+
+    def centred_training_images(self) -> Iterator[Tensor]:
+        """Centre crops of every training frame in the order of ``PoseBatch.index``, (B, 3, H, W) in 0..1."""
+        images, size = self._loaded["train"].data.images, self.hparams["eval_batch_size"]
+        for start in range(0, len(images), size):
+            yield center_crop(torch.from_numpy(np.array(images[start : start + size])), self.crop)
 
     def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
         """Crop and normalise on the device, jitter while training; intrinsics follow each image's crop."""

@@ -9,6 +9,7 @@ from torch import nn
 from mambaloc.errors import InputError
 from mambaloc.losses.log_quaternion import LogQuaternionWeights, RelativeLogQuaternionWeights
 from mambaloc.losses.reprojection import Reprojection
+from mambaloc.losses.soft_targets import Soft, SoftTargets, cosine_distance, softened_kl
 from mambaloc.losses.weighted import FixedWeights, LearnedWeights
 
 LOSSES: dict[str, type[nn.Module]] = {
@@ -41,5 +42,9 @@ __all__ = [
     "LogQuaternionWeights",
     "RelativeLogQuaternionWeights",
     "Reprojection",
+    "Soft",
+    "SoftTargets",
     "build_loss",
+    "cosine_distance",
+    "softened_kl",
 ]

@@ -40,10 +40,17 @@ class Student(PoseNetwork):
         self.orientation_gis = build_gis(gis, width, discretisation)
         self.head = PoseHead(width)
 
+    def latent(self, image: Tensor) -> Tensor:
+        """Return the feature that distillation compares with the teacher's, (B, width)."""
+        return self.fc(self.backbone(image))
+
+    def branches(self, latent_BD: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn the latent feature into both branches' features; (B, width) each."""
+        return self.position_gis(latent_BD), self.orientation_gis(latent_BD)
+
     def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return both branches' global features, what their heads read; (B, width) each."""
-        feats_BD = self.fc(self.backbone(image))
-        return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
+        return self.branches(self.latent(image))
 
 
 @register_model("student")

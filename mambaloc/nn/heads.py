@@ -56,6 +56,10 @@ class PositionScale(nn.Module):
         self.mean_m.copy_(position_m.mean(0))
         self.scale_m.copy_((position_m - position_m.mean(0)).square().sum(-1).mean().sqrt().clamp_min(1e-3))
 
+    def normalise(self, position_m: Tensor) -> Tensor:
+        """Tell positions in metres relative to the scene's mean and scale; (..., 3) -> (..., 3)."""
+        return (position_m - self.mean_m) / self.scale_m
+
     def forward(self, normalised: Tensor) -> Tensor:
         """Undo the normalisation."""
         return normalised * self.scale_m + self.mean_m

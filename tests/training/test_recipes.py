@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import lightning as L
 import pytest
 import yaml
 
@@ -9,6 +10,7 @@ from mambaloc.cli import main
 from mambaloc.data.rendering.layouts import write_cambridge
 from mambaloc.data.rendering.shots import FRAME_CAMBRIDGE, shots_of_sequences
 from mambaloc.data.rendering.trajectories import smooth_trajectory
+from mambaloc.models import create_model
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -28,10 +30,22 @@ def cambridge(tmp_path_factory):
     return root
 
 
-def stand_in(recipe: Path, scenes: Path, cambridge: Path) -> list[str]:
+@pytest.fixture(scope="session")
+def teacher(tmp_path_factory):
+    path = tmp_path_factory.mktemp("teacher") / "best.ckpt"
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
+    trainer.strategy.connect(
+        create_model("mambaloc", image_size=48, encoder_layers=1, backbone="mobilenetv3_small_050")
+    )
+    trainer.save_checkpoint(path)
+    return path
+
+
+def stand_in(recipe: Path, scenes: Path, cambridge: Path, teacher: Path) -> list[str]:
     """Options that put a small rendered scene in the place of data and weights that are not there."""
-    data = yaml.safe_load(recipe.read_text())["data"]
+    data, model = (yaml.safe_load(recipe.read_text())[section] for section in ("data", "model"))
     options = ["--model.backbone_weights", "null", "--model.warm_start", "null", "--trainer.accelerator", "cpu"]
+    options += ["--model.teacher", str(teacher)] if "teacher" in model["init_args"] else []
     options += ["--data.image_size", "48", "--data.short_side", "48"]
     if data["dataset"] == "cambridge":
         return [*options, "--data.root", str(cambridge), "--data.scene", "KingsCollege"]
@@ -40,8 +54,8 @@ def stand_in(recipe: Path, scenes: Path, cambridge: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
-def test_recipe_runs(recipe, scenes, cambridge, tmp_path):
-    options = [*stand_in(recipe, scenes, cambridge), "--trainer.fast_dev_run", "1", "--data.batch_size", "2"]
+def test_recipe_runs(recipe, scenes, cambridge, teacher, tmp_path):
+    options = [*stand_in(recipe, scenes, cambridge, teacher), "--trainer.fast_dev_run", "1", "--data.batch_size", "2"]
     options += ["--data.validation", "sequences", "--data.val_sequences", "null"]
     for subcommand in ("fit", "validate", "test", "predict"):
         cli = main([subcommand, str(recipe), *options, "--trainer.default_root_dir", str(tmp_path)])
@@ -66,8 +80,8 @@ def test_overlay_changes_what_it_says(overlay, tiny_recipe, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", [r for r in RECIPES if r.stem.endswith("_7scenes")], ids=lambda path: path.stem)
-def test_every_system_takes_the_equal_budget(recipe, scenes, cambridge, tmp_path):
-    options = [*stand_in(recipe, scenes, cambridge), "--trainer.default_root_dir", str(tmp_path)]
+def test_every_system_takes_the_equal_budget(recipe, scenes, cambridge, teacher, tmp_path):
+    options = [*stand_in(recipe, scenes, cambridge, teacher), "--trainer.default_root_dir", str(tmp_path)]
     cli = main([str(recipe), str(BLOCKS), *options, "--trainer.fast_dev_run", "1", "--data.batch_size", "2"])
     assert cli.model.hparams["backbone"] == "mobilenetv2_100"
     assert cli.trainer.state.finished
