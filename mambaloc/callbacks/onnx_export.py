@@ -7,7 +7,7 @@ from pathlib import Path
 import lightning as L
 from lightning.pytorch.utilities import rank_zero_info
 
-from mambaloc.export import export_onnx
+from mambaloc.export import contract_of, export_onnx
 from mambaloc.models import LitPoseRegressor, load
 
 
@@ -28,5 +28,6 @@ class OnnxExport(L.Callback):
         assert isinstance(pl_module, LitPoseRegressor)
         best = getattr(trainer.checkpoint_callback, "best_model_path", "")
         path = Path(trainer.default_root_dir) / "model.onnx"
-        parity = export_onnx(load(best) if best else pl_module, path)
+        system = load(best) if best else pl_module
+        parity = export_onnx(system, path, contract_of(system, trainer.datamodule.hparams))  # type: ignore[attr-defined]
         rank_zero_info(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch")

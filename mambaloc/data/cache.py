@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from filelock import FileLock
 from numpy.typing import NDArray
@@ -25,10 +24,9 @@ from rich.progress import track
 
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
+from mambaloc.images import END_BYTES, decode_image, resized
 
 _VERSION = 1
-_EDGE_BYTES = 4096
-_MARKERS = {b"\x89PNG": b"IEND", b"\xff\xd8\xff": b"\xff\xd9"}  # how a format starts, and how a whole file ends
 
 
 @dataclass(frozen=True)
@@ -97,8 +95,8 @@ def _fingerprint(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
-            head = file.read(_EDGE_BYTES)
-            file.seek(max(0, size - _EDGE_BYTES))
+            head = file.read(END_BYTES)
+            file.seek(max(0, size - END_BYTES))
             return hashlib.sha256(f"{size}\0".encode() + head + file.read()).digest()
     except OSError:
         return b"missing"
@@ -146,20 +144,10 @@ def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:
         data = path.read_bytes()
     except OSError:
         return "image cannot be read"
-    for start, end in _MARKERS.items():
-        # OpenCV fills what a truncated file lacks with grey and says nothing.
-        if data.startswith(start) and end not in data[-_EDGE_BYTES:]:
-            return "image is truncated"
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    except cv2.error:  # a damaged header that asks for more than 2^30 pixels
-        image = None
-    if image is None:
-        return "image cannot be decoded"
-    scale = short_side / min(image.shape[:2])
-    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
-    resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-    return np.ascontiguousarray(resized[..., ::-1].transpose(2, 0, 1))
+    image = decode_image(data)
+    if isinstance(image, str):
+        return image
+    return np.ascontiguousarray(resized(image, short_side).transpose(2, 0, 1))
 
 
 def _size(frame: NDArray[np.uint8]) -> str:

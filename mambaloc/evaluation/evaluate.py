@@ -15,10 +15,11 @@ from mambaloc import provenance
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.references import median_training_pose
-from mambaloc.evaluation.trajectories import write_csv, write_tum
+from mambaloc.evaluation.trajectories import write_csv
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models import LitPoseRegressor, load
 from mambaloc.models.base import mib, parameter_count, read_checkpoint
+from mambaloc.runtime.trajectory import write_tum
 from mambaloc.viz import draw_trajectory
 
 
@@ -149,8 +150,8 @@ def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, data: PoseD
         out.mkdir(parents=True, exist_ok=True)
         (out / "metrics.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
         write_csv(out / "predictions.csv", table, frames)
-        write_tum(out / "predictions.tum", table.index, table.predicted_position_m, table.predicted_quaternion)
-        write_tum(out / "ground_truth.tum", table.index, table.true_position_m, table.true_quaternion)
+        write_tum(out / "predictions.tum", table.index.tolist(), table.predicted_position_m, table.predicted_quaternion)
+        write_tum(out / "ground_truth.tum", table.index.tolist(), table.true_position_m, table.true_quaternion)
         chosen = result["selection"].split(":")[0]
         title = f"{result['model']['name']} on {result['data']['scene']}, test, {chosen} epoch"
         draw_trajectory(table, frames.sequences, out / "trajectory.png", title)

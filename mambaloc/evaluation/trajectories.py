@@ -1,24 +1,12 @@
-"""Per-frame predictions as files: CSV for people, TUM for trajectory tools such as evo."""
+"""Per-frame predictions as a CSV file."""
 
 from __future__ import annotations
 
 import csv
 from pathlib import Path
 
-from torch import Tensor
-
 from mambaloc.data import Frames
 from mambaloc.metrics import PoseErrorTable
-
-
-def write_tum(path: Path, index: Tensor, position_m: Tensor, quaternion: Tensor) -> None:
-    """Write lines ``timestamp tx ty tz qx qy qz qw``; the timestamp is the frame's row in its split.
-
-    TUM puts the scalar last, unlike everything else here.
-    """
-    rows = zip(index.tolist(), position_m.tolist(), quaternion.tolist(), strict=True)
-    lines = [" ".join(f"{n:.9g}" for n in (i, *xyz, qx, qy, qz, qw)) for i, xyz, (qw, qx, qy, qz) in rows]
-    path.write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n", encoding="utf-8")
 
 
 def write_csv(path: Path, table: PoseErrorTable, frames: Frames) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import hashlib
 import io
-import json
 import logging
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import onnxruntime
 import torch
@@ -20,6 +22,7 @@ from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PositionScale
+from mambaloc.runtime.contract import METADATA_KEY, Contract, Preprocessing
 
 OPSET = 18
 _CHECKED_BATCHES = (1, 3)
@@ -50,12 +53,15 @@ class DeployedNetwork(nn.Module):
         return prediction.position_m, canonical(prediction.quaternion)
 
 
-def export_onnx(system: LitPoseRegressor, path: Path, tolerance_m: float = 1e-3, tolerance_deg: float = 0.05) -> Parity:
+def export_onnx(
+    system: LitPoseRegressor, path: Path, contract: Contract, tolerance_m: float = 1e-3, tolerance_deg: float = 0.05
+) -> Parity:
     """Write a system's network as ONNX, with any batch size, and check it in ONNX Runtime.
 
     Args:
         system: trained; left as it was.
         path: the file; it appears only once it is complete and has passed.
+        contract: what the file tells of itself; :func:`contract_of` makes it.
         tolerance_m: largest position difference allowed, in metres per metre of the scene's size (at least one).
         tolerance_deg: largest rotation difference allowed.
 
@@ -66,7 +72,7 @@ def export_onnx(system: LitPoseRegressor, path: Path, tolerance_m: float = 1e-3,
     partial = path.with_name(f".{path.name}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _write(deployed, system, partial)
+        _write(deployed, contract, partial)
         parity = check_parity(deployed, partial, system.image_size)
         size_m = max(1.0, _largest_position_m(deployed))
         if not (parity.position_m <= tolerance_m * size_m and parity.rotation_deg <= tolerance_deg):
@@ -81,6 +87,27 @@ def export_onnx(system: LitPoseRegressor, path: Path, tolerance_m: float = 1e-3,
         with contextlib.suppress(OSError):  # not there, or nowhere that a file could be
             partial.unlink()
     return parity
+
+
+def contract_of(system: LitPoseRegressor, data: Mapping[str, Any]) -> Contract:
+    """Say what a system's exported network promises.
+
+    Args:
+        system: trained.
+        data: hyperparameters of the data module that it was trained with.
+    """
+    preprocessing = Preprocessing(data["short_side"], system.image_size)
+    scene = f"{data['dataset']}/{data['scene']}"
+    return Contract(system.registry_name, scene, preprocessing, system.provenance, weights_sha256(system.network))
+
+
+def weights_sha256(network: nn.Module) -> str:
+    """Digest of a network's parameters and buffers as float32, in the order of their names."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(network.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().float().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], seed: int = 0) -> Parity:
@@ -98,8 +125,8 @@ def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], s
     return Parity(torch.stack(position_m).max().item(), torch.stack(rotation_deg).max().item())  # NaN stays NaN
 
 
-def _write(deployed: nn.Module, system: LitPoseRegressor, path: Path) -> None:
-    image = torch.zeros(2, 3, *system.image_size)
+def _write(deployed: nn.Module, contract: Contract, path: Path) -> None:
+    image = torch.zeros(2, 3, *contract.preprocessing.crop)
     with _quiet():
         program = torch.onnx.export(
             deployed,
@@ -112,14 +139,7 @@ def _write(deployed: nn.Module, system: LitPoseRegressor, path: Path) -> None:
             verbose=False,
         )
     assert program is not None
-    program.model.metadata_props["mambaloc"] = json.dumps(
-        {
-            "model": system.registry_name,
-            "input": {"image": {"shape": ["batch", 3, *system.image_size], "range": [0, 1], "colour": "RGB"}},
-            "pose": "world_from_cam, metres, quaternion wxyz with w >= 0, OpenCV camera axes",
-            "trained": system.provenance,
-        }
-    )
+    program.model.metadata_props[METADATA_KEY] = contract.to_json()
     program.save(str(path), external_data=False)
 
 

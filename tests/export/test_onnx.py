@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from mambaloc.errors import InputError
-from mambaloc.export import Parity, export_onnx
+from mambaloc.export import Parity, contract_of, export_onnx
 from mambaloc.export import onnx as onnx_module
 from mambaloc.geometry import canonical
 from mambaloc.models.mambaloc import LitMambaLoc
@@ -19,6 +19,7 @@ from mambaloc.models.mambaloc import LitMambaLoc
 pytestmark = pytest.mark.slow
 
 SIZE = (48, 64)
+DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 56}
 
 
 def tiny(gis: str = "gis", **kwargs) -> LitMambaLoc:
@@ -55,7 +56,7 @@ def exported(tmp_path_factory) -> Exported:
     system = tiny().train()
     system.provenance = {"commit": "abc", "seed": 7}
     before = {k: v.clone() for k, v in system.state_dict().items()}
-    parity = export_onnx(system, path)
+    parity = export_onnx(system, path, contract_of(system, DATA))
     return Exported(path, system, parity, before, [m.training for m in system.network.modules()])
 
 
@@ -90,7 +91,8 @@ def test_the_file_tells_what_it_is(exported):
     assert {o.domain for o in model.opset_import} <= {"", "ai.onnx"}  # runs wherever plain ONNX runs
     metadata = json.loads({p.key: p.value for p in model.metadata_props}["mambaloc"])
     assert metadata["model"] == "mambaloc"
-    assert metadata["input"]["image"]["shape"] == ["batch", 3, *SIZE]
+    assert metadata["input"]["shape"] == ["batch", 3, *SIZE]
+    assert (metadata["preprocessing"]["short_side"], metadata["scene"]) == (56, "7scenes/heads")
     assert "wxyz" in metadata["pose"]
     assert metadata["trained"] == {"commit": "abc", "seed": 7}
     (image,) = model.graph.input
@@ -117,7 +119,7 @@ def test_the_system_is_left_as_it_was(exported):
 @pytest.mark.parametrize(("gis", "discretisation"), [("classical", "euler"), ("gis", "zoh")])
 def test_every_kind_of_gis_is_exported(tmp_path, gis, discretisation):
     system = tiny(gis, discretisation=discretisation)
-    parity = export_onnx(system, tmp_path / "model.onnx")
+    parity = export_onnx(system, tmp_path / "model.onnx", contract_of(system, DATA))
     assert parity.rotation_deg < 0.05
     position_m, _ = run(tmp_path / "model.onnx", images(5))
     with torch.no_grad():
@@ -130,14 +132,14 @@ def test_every_kind_of_gis_is_exported(tmp_path, gis, discretisation):
 @pytest.fixture
 def quick_write(exported, monkeypatch):
     """Skip the slow conversion: every file written is that of ``exported``."""
-    monkeypatch.setattr(onnx_module, "_write", lambda deployed, system, path: path.write_bytes(content))
+    monkeypatch.setattr(onnx_module, "_write", lambda deployed, contract, path: path.write_bytes(content))
     content = exported.path.read_bytes()
     return exported.system
 
 
 def refused(system: LitMambaLoc, path: Path, match: str, **kwargs) -> None:
     with pytest.raises(InputError, match=match) as error:
-        export_onnx(system, path, **kwargs)
+        export_onnx(system, path, contract_of(system, DATA), **kwargs)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
 
@@ -170,7 +172,7 @@ def test_a_failure_leaves_the_previous_file(quick_write, tmp_path):
     (tmp_path / "model.onnx").write_text("previous")
     refused(quick_write, tmp_path / "model.onnx", "differs", tolerance_m=-1.0)
     assert (tmp_path / "model.onnx").read_text() == "previous"
-    assert export_onnx(quick_write, tmp_path / "model.onnx") is not None
+    assert export_onnx(quick_write, tmp_path / "model.onnx", contract_of(quick_write, DATA)) is not None
     assert (tmp_path / "model.onnx").stat().st_size > 1000
 
 

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 
 import mambaloc
 from mambaloc.benchmark.latency import random_frames
-from mambaloc.export import export_onnx
+from mambaloc.export import contract_of, export_onnx
 from mambaloc.models import LitPoseRegressor
 from mambaloc.models.registry import model_class
 from mambaloc.nn import MambaMixer
@@ -134,7 +134,9 @@ def test_checkpoint_round_trip(name, gis, tmp_path):
 @pytest.mark.slow
 @EACH_ONCE
 def test_onnx_runtime_agrees(name, tmp_path):
-    parity = export_onnx(small(name, "gis"), tmp_path / "model.onnx", tolerance_m=1e-4, tolerance_deg=0.01)
+    system = small(name, "gis")
+    contract = contract_of(system, {"dataset": "7scenes", "scene": "heads", "short_side": SIDE})
+    parity = export_onnx(system, tmp_path / "model.onnx", contract, tolerance_m=1e-4, tolerance_deg=0.01)
     assert (tmp_path / "model.onnx").is_file()
     assert parity.position_m < 1e-4
 

@@ -1,0 +1,100 @@
+"""What an exported model promises: what it must be fed, what it says, where it came from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from mambaloc.errors import InputError
+from mambaloc.images import Image, center_cropped, resized
+
+VERSION = 1
+METADATA_KEY = "mambaloc"
+POSE = (
+    "world_from_cam: camera centre in metres, unit quaternion wxyz with w >= 0; "
+    "OpenCV camera axes (x right, y down, z forward)"
+)
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """What an image goes through before the network sees it.
+
+    Args:
+        short_side: what the shorter side is resized to, in pixels, averaging areas.
+        crop: (height, width) taken from the middle.
+        in_model: the model does it, and is fed (height, width, 3) ``uint8`` of any size.
+    """
+
+    short_side: int
+    crop: tuple[int, int]
+    in_model: bool = False
+
+    def apply(self, image: Image) -> Image:
+        """Resize and crop an RGB image; (H, W, 3) -> (*crop, 3)."""
+        return center_cropped(resized(image, self.short_side), self.crop)
+
+
+@dataclass(frozen=True)
+class Contract:
+    """The contract of one model; written into the ONNX file's metadata and into a bundle's ``contract.json``.
+
+    Args:
+        model: registry name of the system.
+        scene: dataset and scene that it knows.
+        preprocessing: of its input.
+        trained: provenance of its training: commit, seed, device, versions.
+        weights_sha256: of its parameters and buffers, whatever precision they are stored in.
+        pose: frame, units and order of its outputs.
+    """
+
+    model: str
+    scene: str
+    preprocessing: Preprocessing
+    trained: dict[str, Any]
+    weights_sha256: str
+    pose: str = POSE
+
+    def to_json(self) -> str:
+        """Write it down, with what its input looks like for those who read no code."""
+        height, width = self.preprocessing.crop
+        raw = self.preprocessing.in_model
+        tensor = {
+            "name": "image",
+            "dtype": "uint8" if raw else "float32",
+            "shape": ["height", "width", 3] if raw else ["batch", 3, height, width],
+            "range": [0, 255] if raw else [0, 1],
+            "colour": "RGB",
+        }
+        outputs = {"position_m": ["batch", 3], "quaternion_wxyz": ["batch", 4]}
+        return json.dumps({"contract": VERSION, **asdict(self), "input": tensor, "outputs": outputs}, indent=2)
+
+    @classmethod
+    def from_json(cls, text: str, where: str) -> Contract:
+        """Read it.
+
+        Args:
+            text: what :meth:`to_json` wrote.
+            where: the file, for messages.
+
+        Raises:
+            InputError: for anything else.
+        """
+        try:
+            data = json.loads(text)
+            version, preprocessing = data["contract"], data["preprocessing"]
+            if version != VERSION:
+                raise InputError(f"{where}: contract of version {version!r}, this reads {VERSION}; export it anew")
+            height, width = map(int, preprocessing["crop"])
+            return cls(
+                str(data["model"]),
+                str(data["scene"]),
+                Preprocessing(int(preprocessing["short_side"]), (height, width), bool(preprocessing["in_model"])),
+                dict(data["trained"]),
+                str(data["weights_sha256"]),
+                str(data["pose"]),
+            )
+        except (ValueError, KeyError, TypeError) as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise InputError(f"{where}: its contract cannot be read ({reason}); export the model anew") from None

@@ -1,0 +1,134 @@
+"""Poses from images with an exported model."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.images import Image, decode_image
+from mambaloc.runtime.contract import METADATA_KEY, Contract
+
+_IN_A_BUNDLE = ("model.onnx", "model.fp16.onnx", "model.ort")
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Where one image was taken: ``world_from_cam``.
+
+    Shape:
+        ``position_m`` (3,) camera centre in metres; ``quaternion`` (4,) unit, wxyz, ``w >= 0``.
+
+    Args:
+        position_m: in the scene's frame.
+        quaternion: likewise.
+        latency_s: seconds that preprocessing and the network took.
+    """
+
+    position_m: NDArray[np.float32]
+    quaternion: NDArray[np.float32]
+    latency_s: float
+
+
+class Localiser:
+    """A model on ONNX Runtime.
+
+    Args:
+        model: an ``.onnx`` or ``.ort`` file that ``tools/export.py`` wrote, or a bundle's folder.
+        threads: that one image may use; ONNX Runtime's choice unless given.
+
+    Raises:
+        InputError: where there is no such model, it cannot be run, or it carries no contract.
+    """
+
+    def __init__(self, model: str | Path, threads: int | None = None) -> None:
+        self.path = _model_file(Path(model))
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        options.intra_op_num_threads = threads or 0
+        try:
+            self._session = onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime's own exceptions share no base
+            reason = str(error).splitlines()[0]
+            raise InputError(f"{self.path}: ONNX Runtime cannot load it ({reason}); export it anew") from None
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if METADATA_KEY not in metadata:
+            raise InputError(f"{self.path}: carries no contract of its input; export it with tools/export.py")
+        self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
+
+    def localise(self, image: str | Path | Image) -> Localisation:
+        """Localise one image.
+
+        Args:
+            image: a file; or RGB (H, W, 3), or grey (H, W), ``uint8``, of any size.
+
+        Raises:
+            InputError: for a file that is missing or no whole image, or an array of another kind.
+        """
+        rgb = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
+        start = time.perf_counter()
+        position_m, quaternion = self._session.run(None, {"image": self._fed(rgb)})
+        return Localisation(position_m[0], quaternion[0], time.perf_counter() - start)
+
+    def _fed(self, rgb: Image) -> NDArray[np.generic]:
+        preprocessing = self.contract.preprocessing
+        if preprocessing.in_model:
+            return np.ascontiguousarray(rgb)
+        try:
+            cropped = preprocessing.apply(rgb)
+        except Exception as error:  # cv2.error
+            raise InputError(f"image of {rgb.shape[1]}x{rgb.shape[0]}: cannot be resized ({error})") from None
+        if cropped.shape[:2] != preprocessing.crop:
+            width, height = rgb.shape[1], rgb.shape[0]
+            crop = "x".join(map(str, preprocessing.crop[::-1]))
+            raise InputError(
+                f"image of {width}x{height}: resized to short side {preprocessing.short_side} it does not hold the "
+                f"model's crop of {crop}; give frames shaped as in training"
+            )
+        return (cropped.transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32)
+
+
+def read_image(path: str | Path) -> Image:
+    """Read an image file as RGB, upright.
+
+    Raises:
+        InputError: where it is missing or no whole image.
+    """
+    try:
+        image = decode_image(Path(path).read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a picture") from None
+    if isinstance(image, str):
+        raise InputError(f"{path}: {image}; give a whole JPEG or PNG")
+    return image
+
+
+def as_rgb(image: Image) -> Image:
+    """Check an array and make grey or RGBA RGB; (H, W), (H, W, 3) or (H, W, 4) -> (H, W, 3).
+
+    Raises:
+        InputError: for anything else.
+    """
+    image = np.asarray(image)
+    channels = {2: 1, 3: image.shape[-1]}.get(image.ndim)
+    if image.dtype != np.uint8 or channels not in (1, 3, 4) or 0 in image.shape:
+        raise InputError(f"image array {image.dtype} {image.shape}: give uint8 RGB (H, W, 3) or grey (H, W)")
+    if image.ndim == 2:
+        image = image[..., None]
+    return np.repeat(image, 3, axis=-1) if channels == 1 else image[..., :3]
+
+
+def _model_file(path: Path) -> Path:
+    if path.is_dir():
+        found = [path / name for name in _IN_A_BUNDLE if (path / name).is_file()]
+        if not found:
+            raise InputError(f"{path}: holds none of {', '.join(_IN_A_BUNDLE)}; give a bundle of tools/export.py")
+        return found[0]
+    if not path.is_file():
+        raise InputError(f"{path}: no such model; tools/export.py writes them")
+    return path

@@ -1,0 +1,82 @@
+"""Frames one after another: of a video, a folder of pictures, or a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from mambaloc.errors import InputError
+from mambaloc.images import Image
+from mambaloc.runtime.localiser import read_image
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One frame of a source.
+
+    Args:
+        name: file, or number in the video.
+        time_s: since the first frame; of pictures, their place in the list.
+        image: RGB, (H, W, 3).
+    """
+
+    name: str
+    time_s: float
+    image: Image
+
+
+def frames_of(source: str | Path) -> tuple[Iterator[SourceFrame], int | None]:
+    """Open a source; return its frames, and how many there are where that is known.
+
+    Args:
+        source: a video file, a picture, a folder of pictures (by name), or the number of a camera.
+
+    Raises:
+        InputError: where there is no such source, or nothing in it.
+    """
+    if str(source).isdecimal():
+        return _of_capture(_opened(int(str(source)), f"camera {source}")), None
+    path = Path(source)
+    if path.is_dir():
+        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in _PICTURES)
+        if not pictures:
+            raise InputError(f"{path}: holds no picture ({', '.join(_PICTURES)}); give a folder of them or a video")
+        return _of_pictures(pictures), len(pictures)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, folder or camera; a camera is a number, as 0")
+    if path.suffix.lower() in _PICTURES:
+        return _of_pictures([path]), 1
+    capture = _opened(str(path), str(path))
+    count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    return _of_capture(capture), count if count > 0 else None
+
+
+def _of_pictures(paths: list[Path]) -> Iterator[SourceFrame]:
+    for number, path in enumerate(paths):
+        yield SourceFrame(path.name, float(number), read_image(path))
+
+
+def _opened(what: str | int, name: str) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(what)
+    if not capture.isOpened():
+        raise InputError(f"{name}: cannot be opened as a video; give a video that FFmpeg reads")
+    return capture
+
+
+def _of_capture(capture: cv2.VideoCapture) -> Iterator[SourceFrame]:
+    try:
+        number = 0
+        while True:
+            read, image = capture.read()
+            if not read:
+                break
+            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000  # of the frame just read
+            yield SourceFrame(str(number), time_s, image[..., ::-1])  # type: ignore[arg-type]
+            number += 1
+    finally:
+        capture.release()

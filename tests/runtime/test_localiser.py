@@ -1,0 +1,210 @@
+"""The torch-free runtime against the system that a file was exported from."""
+
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from mambaloc.data.augmentation import center_crop
+from mambaloc.errors import InputError
+from mambaloc.export import contract_of, export_onnx
+from mambaloc.geometry import canonical
+from mambaloc.models.student import LitStudent
+from mambaloc.runtime import Contract, Localiser, Preprocessing, frames_of
+from mambaloc.runtime.localiser import as_rgb, read_image
+
+DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 48}
+
+
+@pytest.fixture(scope="module")
+def student():
+    torch.manual_seed(0)
+    system = LitStudent(backbone="resnet10t", width=16, image_size=(40, 56))
+    system.network.head.position_scale.fit(torch.randn(9, 3) * 4)
+    with torch.no_grad():
+        system.network.head.rotation[0].bias.zero_()
+    system.provenance = {"commit": "abc", "seed": 3}
+    return system.eval()
+
+
+@pytest.fixture(scope="module")
+def model(student, tmp_path_factory):
+    path = tmp_path_factory.mktemp("runtime") / "model.onnx"
+    export_onnx(student, path, contract_of(student, DATA))
+    return path
+
+
+def picture(height=90, width=120, seed=0):
+    coarse = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def test_a_picture_is_localised_as_training_sees_it(student, model, tmp_path):
+    rgb = picture()
+    cv2.imwrite(str(tmp_path / "a.png"), rgb[..., ::-1])
+    small = cv2.resize(rgb, (64, 48), interpolation=cv2.INTER_AREA)  # as the cache decodes frames
+    with torch.no_grad():
+        expected = student(center_crop(torch.from_numpy(small.transpose(2, 0, 1))[None], student.image_size))
+    for given in (rgb, tmp_path / "a.png", str(tmp_path / "a.png")):
+        found = Localiser(model).localise(given)
+        np.testing.assert_allclose(found.position_m, expected.position_m[0], atol=1e-4)
+        np.testing.assert_allclose(found.quaternion, canonical(expected.quaternion)[0], atol=1e-5)
+        assert found.latency_s > 0
+
+
+def test_the_contract_travels_with_the_model(student, model):
+    contract = Localiser(model).contract
+    assert contract == contract_of(student, DATA)
+    assert contract.preprocessing == Preprocessing(48, (40, 56))
+    assert contract.trained == {"commit": "abc", "seed": 3}
+    assert Contract.from_json(contract.to_json(), "here") == contract
+
+
+def test_the_runtime_needs_no_torch(model, tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), picture())
+    program = (
+        "import sys; sys.modules['torch'] = None\n"
+        "import mambaloc\nfrom mambaloc.runtime import Localiser\n"
+        f"print(Localiser({str(model)!r}).localise({str(tmp_path / 'a.png')!r}).position_m.tolist())\n"
+        "heavy = {'lightning', 'timm', 'torchvision'} & set(sys.modules)\nassert not heavy, heavy"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert len(json.loads(result.stdout)) == 3
+
+
+# --- pictures of every kind ------------------------------------------------------------------------------------------
+
+
+def test_grey_and_transparent_pictures_are_rgb(model, tmp_path):
+    grey = picture()[..., 0]
+    as_three = np.repeat(grey[..., None], 3, axis=-1)
+    expected = Localiser(model).localise(as_three)
+    cv2.imwrite(str(tmp_path / "grey.png"), grey)
+    cv2.imwrite(str(tmp_path / "rgba.png"), np.dstack([as_three, np.full_like(grey, 7)]))
+    for given in (grey, grey[..., None], np.dstack([as_three, grey]), tmp_path / "grey.png", tmp_path / "rgba.png"):
+        np.testing.assert_array_equal(Localiser(model).localise(given).position_m, expected.position_m)
+
+
+def test_a_turned_photograph_is_made_upright(tmp_path):
+    """EXIF orientation 6: the camera was turned, the picture must be turned back by 90 degrees."""
+    rgb = picture()
+    _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1])
+    exif = (
+        b"Exif\x00\x00II*\x00\x08\x00\x00\x00\x01\x00\x12\x01\x03\x00\x01\x00\x00\x00\x06\x00\x00\x00\x00\x00\x00\x00"
+    )
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    (tmp_path / "a.jpg").write_bytes(bytes(jpeg)[:2] + segment + bytes(jpeg)[2:])
+    (tmp_path / "b.jpg").write_bytes(bytes(jpeg))
+    turned = np.rot90(read_image(tmp_path / "b.jpg"), k=-1)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.jpg"), turned)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "cannot be decoded"),
+        (b"no picture", "cannot be decoded"),
+        (None, "cannot be read"),
+        ("half", "truncated"),
+    ],
+)
+def test_what_is_no_picture(content, message, model, tmp_path):
+    path = tmp_path / "bad.png"
+    if content == "half":
+        content = cv2.imencode(".png", picture())[1].tobytes()[:200]
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as error:
+        Localiser(model).localise(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("array", [np.zeros((4, 4, 3)), np.zeros((4, 4, 2), np.uint8), np.zeros((0, 4, 3), np.uint8)])
+def test_arrays_of_other_kinds_are_refused(array):
+    with pytest.raises(InputError, match="give uint8 RGB"):
+        as_rgb(array)
+
+
+def test_a_picture_too_narrow_for_the_crop_is_refused(model):
+    with pytest.raises(InputError, match="does not hold the model's crop of 56x40"):
+        Localiser(model).localise(picture(120, 120))
+
+
+def test_huge_and_tiny_pictures_are_localised(model):
+    for size in ((3000, 4000), (6, 8)):
+        assert np.isfinite(Localiser(model).localise(picture(*size)).position_m).all()
+
+
+# --- models of every kind --------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_model(model, tmp_path):
+    def refused(path, message):
+        with pytest.raises(InputError, match=message) as error:
+            Localiser(path)
+        assert "\n" not in str(error.value)
+
+    refused(tmp_path / "nothing.onnx", "no such model")
+    refused(tmp_path, "holds none of model.onnx")
+    (tmp_path / "noise.onnx").write_bytes(b"noise" * 50)
+    refused(tmp_path / "noise.onnx", "cannot load it")
+    plain = onnx.load(model)
+    del plain.metadata_props[:]
+    onnx.save(plain, tmp_path / "plain.onnx")
+    refused(tmp_path / "plain.onnx", "carries no contract")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"contract": 2}, "version 2, this reads 1"),
+        ({"preprocessing": {"short_side": 48}}, "cannot be read"),
+        ({"preprocessing": {"short_side": 48, "crop": [1, 2, 3], "in_model": False}}, "cannot be read"),
+        ({"trained": 3}, "cannot be read"),
+    ],
+)
+def test_contracts_are_checked(change, message, student):
+    contract = json.loads(contract_of(student, DATA).to_json())
+    with pytest.raises(InputError, match=message):
+        Contract.from_json(json.dumps({**contract, **change}), "contract.json")
+    with pytest.raises(InputError, match="cannot be read"):
+        Contract.from_json("{", "contract.json")
+
+
+# --- sources ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_is_read_by_name(tmp_path):
+    for name, seed in (("b.png", 1), ("a.png", 0), ("c.txt", 2)):
+        (tmp_path / name).write_bytes(cv2.imencode(".png", picture(seed=seed))[1].tobytes())
+    frames, count = frames_of(tmp_path)
+    listed = list(frames)
+    assert count == 2
+    assert [(frame.name, frame.time_s) for frame in listed] == [("a.png", 0.0), ("b.png", 1.0)]
+    np.testing.assert_array_equal(listed[0].image[..., ::-1], picture(seed=0))
+
+
+def test_a_video_is_read_with_its_times(tmp_path):
+    writer = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (120, 90))
+    for seed in range(4):
+        writer.write(picture(seed=seed)[..., ::-1])
+    writer.release()
+    frames, count = frames_of(tmp_path / "film.avi")
+    listed = list(frames)
+    assert count == len(listed) == 4
+    assert [frame.time_s for frame in listed] == pytest.approx([0, 0.1, 0.2, 0.3], abs=1e-3)
+    assert np.abs(listed[2].image.astype(int) - picture(seed=2)).mean() < 6  # JPEG
+
+
+def test_what_is_no_source(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "film.mp4").write_bytes(b"no film")
+    for source, message in (("empty", "holds no picture"), ("film.mp4", "cannot be opened"), ("none", "no such file")):
+        with pytest.raises(InputError, match=message):
+            frames_of(tmp_path / source)
