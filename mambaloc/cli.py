@@ -90,6 +90,9 @@ class RecipeCLI(LightningCLI):
         if checkpoint := self.config[self.config["subcommand"]].get("ckpt_path"):
             read_checkpoint(checkpoint)
 
+    def _parse_ckpt_path(self) -> None:
+        """Resume what the command says: Lightning would put the checkpoint's hyperparameters over the recipe's."""
+
     def before_instantiate_classes(self) -> None:
         """Without validation no epoch is better than another."""
         config = self.config[self.subcommand]

@@ -62,9 +62,12 @@ class Teacher:
 class DistillationTerms(nn.Module):
     """What only distillation trains: the weights of the soft loss, and a projection of the student's latent feature.
 
+    The projection stands even where the widths agree: the latent feature has been through a ReLU, and a vector without
+    negative entries cannot come near the teacher's.
+
     Args:
         latent: width of the student's feature.
-        feature: width of the teacher's; a student of the same width needs no projection.
+        feature: width of the teacher's.
         soft: ``kl`` or ``l2``.
         soft_args: of :class:`~mambaloc.losses.SoftTargets`.
 
@@ -78,7 +81,7 @@ class DistillationTerms(nn.Module):
             self.soft = SoftTargets(soft, **(soft_args or {}))
         except (TypeError, ValueError) as error:
             raise InputError(f"model.soft_args {soft_args}: the soft loss does not take them ({error})") from None
-        self.projection = nn.Identity() if latent == feature else nn.Linear(latent, feature)
+        self.projection = nn.Linear(latent, feature)
 
 
 class LitDistillation(LitStudent):

@@ -24,7 +24,8 @@ def main() -> None:
     for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
         loading.add_argument(name, default=default)
     args = parser.parse_args()
-    machine = f"{provenance.device_name()}, commit {provenance.commit()}"
+    cuda = 0 if getattr(args, "device", "cpu") == "cuda" else None
+    machine = f"{provenance.device_name(cuda)}, commit {provenance.commit()}"
     if args.what == "sizes":
         benchmark.print_sizes(benchmark.size_table())
     elif args.what == "loading":

@@ -64,8 +64,9 @@ def measure_latency(
     """
     if repetitions < 4:
         raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(f"--device {device}: no CUDA device is visible here; use cpu")
+    visible = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    if device not in visible:
+        raise InputError(f"--device {device}: not here; choose one of {', '.join(visible)}")
     cells = [(name, batch) for name in systems for batch in batches]
     console = Console(stderr=True)
     found: list[Latency] = []

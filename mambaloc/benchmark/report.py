@@ -46,7 +46,7 @@ def _replaced(sizes: Sequence[Size]) -> list[str]:
 
 def print_latencies(latencies: Sequence[Latency], image_size: int, machine: str) -> None:
     """Print a row a system, measure and batch: medians, the ratio, its spread; then operations."""
-    title = f"Seconds without and with GIS, {image_size} px, {machine}"
+    title = f"Milliseconds without and with GIS, {image_size} px, {machine}"
     table = _table(title, "system", "what", "batch", "without ms", "with ms", "ratio", "± IQR")
     for each in latencies:
         times = (f"{median(s) * 1000:.1f}" for s in (each.without_s, each.with_s))
@@ -58,6 +58,7 @@ def print_latencies(latencies: Sequence[Latency], image_size: int, machine: str)
     console = Console(highlight=False)
     console.print(table)
     console.print(flops)
+    console.print("Products and convolutions; LSTMs and element-wise operations are not counted.")
 
 
 def print_loading(rates: LoadingRates, machine: str) -> None:

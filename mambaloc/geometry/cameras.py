@@ -18,7 +18,7 @@ def project(points_cam_m: Tensor, intrinsics: Tensor) -> Tensor:
     Shape:
         (..., 3), (..., 3, 3) -> (..., 2), pixels ``(x, y)``.
     """
-    homogeneous = (intrinsics @ points_cam_m[..., None])[..., 0]
+    homogeneous = (intrinsics * points_cam_m[..., None, :]).sum(dim=-1)  # no matmul: TF32 and autocast would round it
     return homogeneous[..., :2] / homogeneous[..., 2:]
 
 

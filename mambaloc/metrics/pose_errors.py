@@ -104,7 +104,8 @@ def summarise(table: PoseErrorTable) -> dict[str, float]:
 
     The median of an even number of frames is the mean of the middle two.
     """
-    position_m, rotation_deg = table.position_error_m.double(), table.rotation_error_deg.double()
+    # On the CPU: Apple's GPUs know no double.
+    position_m, rotation_deg = table.position_error_m.cpu().double(), table.rotation_error_deg.cpu().double()
     summary = {
         "position_error_m": position_m.quantile(0.5).item(),
         "rotation_error_deg": rotation_deg.quantile(0.5).item(),

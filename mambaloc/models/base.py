@@ -103,9 +103,12 @@ class LitPoseRegressor(L.LightningModule):
     def setup(self, stage: str) -> None:
         """Take the scene's position statistics before the first epoch."""
         if stage == "fit" and self.normalise_position:
+            data = getattr(self.trainer, "datamodule", None)
+            if data is None:
+                raise InputError("model.normalise_position: needs the scene; give the trainer a PoseDataModule")
             for module in self.network.modules():
                 if isinstance(module, PositionScale):
-                    module.fit(self.trainer.datamodule.train_position_m)  # type: ignore[attr-defined]
+                    module.fit(data.train_position_m)
 
     def on_train_epoch_start(self) -> None:
         """Log the learning rate."""
@@ -177,8 +180,11 @@ class LitPoseRegressor(L.LightningModule):
             {"params": [p for p in trainable if id(p) not in undecayed], "weight_decay": self.weight_decay},
             {"params": [p for p in trainable if id(p) in undecayed], "weight_decay": 0.0},
         ]
-        # Fused, a step reads and writes each parameter once, which is a tenth of the time on a CPU.
-        optimizer = torch.optim.Adam([g for g in groups if g["params"]], self.lr, (0.9, 0.999), eps=1e-10, fused=True)
+        groups = [group for group in groups if group["params"]]
+        # Fused, a step reads and writes each parameter once, which is a tenth of the time on a CPU; but Lightning
+        # refuses to clip a fused optimiser's gradients under mixed precision.
+        clips = self._trainer is not None and bool(self.trainer.gradient_clip_val)
+        optimizer = torch.optim.Adam(groups, lr=self.lr, betas=(0.9, 0.999), eps=1e-10, fused=not clips)
         scheduler = torch.optim.lr_scheduler.StepLR(optimizer, self.lr_step_epochs, self.lr_gamma)
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from torch import Tensor, nn
 from torchvision.models import GoogLeNet, GoogLeNet_Weights
@@ -59,22 +59,22 @@ class PoseNet(PoseNetwork):
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return both branches' global features, what their heads read; (B, width) each."""
-        return self.branches(self.backbone(image))
+        return self.features_of(self.backbone(image))
 
-    def branches(self, feats_BD: Tensor) -> tuple[Tensor, Tensor]:
+    def features_of(self, pooled_BD: Tensor) -> tuple[Tensor, Tensor]:
         """Turn the backbone's feature into both branches' features; (B, width) each."""
-        feats_BD = self.fc(feats_BD)
+        feats_BD = self.fc(pooled_BD)
         return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
 
 
 class GoogLeNetBackbone(ImageBackbone):
-    """GoogLeNet without its classifiers: a pooled feature, and while training those of its two auxiliary branches.
+    """GoogLeNet without its classifiers: a pooled feature, and those of its two auxiliary branches.
 
     Args:
         weights: ``torchvision`` downloads its own; otherwise a ``.safetensors`` file; None starts from scratch.
 
     Shape:
-        (B, 3, H, W) in 0..1 -> (B, 1024) each.
+        (B, 3, H, W) in 0..1 -> (B, 1024).
 
     Raises:
         InputError: for weights that cannot be fetched, are not there or do not fit.
@@ -83,6 +83,10 @@ class GoogLeNetBackbone(ImageBackbone):
     width = 1024
 
     def __init__(self, weights: str | None = None) -> None:
+        if weights == "timm":
+            raise InputError(
+                "backbone_weights timm: GoogLeNet's are torchvision's; give 'torchvision', a file, or null"
+            )
         body = GoogLeNet(aux_logits=True, init_weights=False)
         body.fc = body.dropout = body.aux1.fc2 = body.aux2.fc2 = nn.Identity()
         half = (0.5, 0.5, 0.5)  # torchvision's weights expect -1..1
@@ -96,8 +100,12 @@ class GoogLeNetBackbone(ImageBackbone):
                     f"({type(error).__name__}); name a local .safetensors file instead, or null to start from scratch"
                 ) from error
 
-    def forward(self, image: Tensor) -> Tensor | tuple[Tensor, Tensor, Tensor]:
-        """Normalise the image and return its feature; while training, also those after stages 4d and 4a."""
+    def forward(self, image: Tensor) -> Tensor:
+        """Normalise the image and return its feature."""
+        return self.with_auxiliary(image)[0] if self.training else self.body(self.normalised(image))
+
+    def with_auxiliary(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """While training: the feature, and those after stages 4d and 4a; (B, 1024) each."""
         return self.body(self.normalised(image))
 
 
@@ -107,6 +115,8 @@ class GoogLeNetPoseNet(PoseNet):
     The arguments and the shapes are those of :class:`PoseNet`; ``auxiliary`` holds two predictions while training.
     """
 
+    backbone: GoogLeNetBackbone
+
     def __init__(self, backbone: GoogLeNetBackbone, **kwargs: Any) -> None:
         super().__init__(backbone, **kwargs)
         self.auxiliary_heads = nn.ModuleList(PoseHead(backbone.width) for _ in range(2))
@@ -115,8 +125,8 @@ class GoogLeNetPoseNet(PoseNet):
         """Localise images."""
         if not self.training:
             return super().forward(image)
-        feats_BD, *auxiliary = self.backbone(image)
-        prediction = self.head(*self.branches(feats_BD))
+        pooled_BD, *auxiliary = self.backbone.with_auxiliary(image)
+        prediction = self.head(*self.features_of(pooled_BD))
         heads = zip(self.auxiliary_heads, auxiliary, strict=True)
         return replace(prediction, auxiliary=tuple(head(feats, feats) for head, feats in heads))
 
@@ -126,7 +136,8 @@ class LitPoseNet(LitPoseRegressor):
     """PoseNet with a fixed balance of position and rotation: its beta is 120 to 750 indoors, 250 to 2000 outdoors.
 
     The arguments are those of :class:`PoseNet` and of :class:`~mambaloc.models.base.LitPoseRegressor`, and
-    ``variant``: ``timm`` for a timm ``backbone`` (ResNet-34), ``googlenet`` for the first publication's.
+    ``variant``: ``timm`` for a timm ``backbone`` (ResNet-34), ``googlenet`` for the first publication's, whose
+    ``backbone_weights`` are ``torchvision``, a file or None, and which has no other argument of a backbone.
     """
 
     def __init__(
@@ -141,22 +152,24 @@ class LitPoseNet(LitPoseRegressor):
 
     def configure_network(self) -> PoseNet:
         """Build the network from the hyperparameters."""
-        options = self.hyperparameters_of(PoseNet)
-        if self.hparams["variant"] == "googlenet":
+        variant, options = self.hparams["variant"], self.hyperparameters_of(PoseNet)
+        if variant not in get_args(Variant):
+            raise InputError(f"model.variant {variant!r}: choose one of {', '.join(get_args(Variant))}")
+        if variant == "googlenet":
             return GoogLeNetPoseNet(GoogLeNetBackbone(self.hparams["backbone_weights"]), **options)
         return PoseNet(PooledBackbone(**self.backbone_arguments), **options)
 
 
 @register_model("posenet_learned")
 class LitPoseNetLearned(LitPoseNet):
-    """PoseNet with learned homoscedastic weights, from s_x = 0 and s_q = -3.
+    """PoseNet with learned homoscedastic weights of L1 distances, from s_x = 0 and s_q = -3.
 
     The arguments are those of :class:`LitPoseNet`.
     """
 
     def __init__(self, loss: str = "learned_weights", loss_args: dict[str, Any] | None = None, **shared: Any) -> None:
-        if loss_args is None and loss == "learned_weights":
-            loss_args = {"s_position": 0.0, "s_rotation": -3.0}
+        if loss == "learned_weights":
+            loss_args = {"norm": "l1", "s_position": 0.0, "s_rotation": -3.0, **(loss_args or {})}
         super().__init__(loss=loss, loss_args=loss_args, **shared)
 
 

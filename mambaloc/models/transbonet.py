@@ -122,7 +122,7 @@ class TransBoNet(PoseNetwork):
         discretisation: Discretisation = "euler",
     ) -> None:
         super().__init__()
-        self.backbone = backbone
+        self.backbone, self.image_size = backbone, image_size
         ((rows, columns),) = backbone.grids(image_size)
         grid = ((rows + 1) // 2, (columns + 1) // 2)
         depths = [*backbone.channels, *[stage_channels] * blocks]
@@ -164,8 +164,8 @@ class LitTransBoNet(LitPoseRegressor):
         loss_args: dict[str, Any] | None = None,
         **shared: Any,
     ) -> None:
-        if loss_args is None and loss == "learned_weights":
-            loss_args = {"norm": "l1", "s_position": 0.0, "s_rotation": -3.0}
+        if loss == "learned_weights":
+            loss_args = {"norm": "l1", "s_position": 0.0, "s_rotation": -3.0, **(loss_args or {})}
         super().__init__(backbone=backbone, loss=loss, loss_args=loss_args, **shared)
 
     def configure_network(self) -> TransBoNet:

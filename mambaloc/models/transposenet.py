@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import torch
 from torch import Tensor
 
 from mambaloc.models.base import LitPoseRegressor
@@ -66,8 +65,6 @@ class TransPoseNet(PoseNetwork):
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return both branches' global features, what their heads read; (B, dim) each."""
-        if image.shape[-2:] != torch.Size(self.image_size):
-            raise ValueError(f"images are {tuple(image.shape[-2:])}, the network was built for {self.image_size}")
         stride8_BCHW, stride16_BCHW = self.backbone(image)
         position_BD = self.position_gis(self.position_encoder(stride16_BCHW))
         orientation_BD = self.orientation_gis(self.orientation_encoder(stride8_BCHW))

@@ -103,11 +103,19 @@ class PoseNetwork(nn.Module):
     """
 
     head: PoseHead
+    image_size: tuple[int, int] | None = None
+    """(height, width) that the network was built for; None takes any."""
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return the position and the orientation branch's global features, (B, D) each."""
         raise NotImplementedError
 
     def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
+        """Localise images.
+
+        Raises:
+            ValueError: for images of another size than the network was built for.
+        """
+        if self.image_size is not None and image.shape[-2:] != torch.Size(self.image_size):
+            raise ValueError(f"images are {tuple(image.shape[-2:])}, the network was built for {self.image_size}")
         return self.head(*self.features(image))

@@ -33,7 +33,12 @@ def test_latency_is_timed_in_turns():
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "message"), [({"repetitions": 3}, "--repetitions 3"), ({"device": "cuda:9"}, "cuda")]
+    ("kwargs", "message"),
+    [
+        ({"repetitions": 3}, "--repetitions 3"),
+        ({"device": "cuda"}, "--device cuda: not here; choose one of cpu"),
+        ({"device": "gpu"}, "gpu"),
+    ],
 )
 def test_what_latency_cannot_measure(kwargs, message, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

@@ -39,6 +39,13 @@ def test_intrinsics_of_a_batch_broadcast_over_its_points():
     torch.testing.assert_close(project(points, cameras[:, None]), singly)
 
 
+def test_mixed_precision_does_not_round_pixels():
+    points = torch.tensor([[0.31234567, 0.2, 2.0], [-0.4, 0.1, 3.0]])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = project(points, K.float())
+    assert torch.equal(mixed, project(points, K.float()))
+
+
 def test_project_is_differentiable():
     points = (random(5, 3) + torch.tensor([0, 0, 4.0])).requires_grad_()
     assert gradcheck(project, (points, K.clone().requires_grad_()))

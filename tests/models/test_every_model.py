@@ -155,6 +155,17 @@ def test_optimiser_holds_every_parameter_once_and_decays_neither_dynamics_nor_lo
     assert {group["weight_decay"] for group in groups} == ({0.25, 0.0} if expected else {0.25})
 
 
+@pytest.mark.parametrize("clip", [None, 1.0])
+def test_gradients_can_be_clipped_under_mixed_precision(clip, tmp_path):
+    system = small("student", "none")
+    trainer = L.Trainer(
+        default_root_dir=tmp_path, accelerator="cpu", max_epochs=1, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, precision="bf16-mixed", gradient_clip_val=clip,
+    )  # fmt: skip
+    trainer.fit(system, DataLoader([frames()], batch_size=None))
+    assert trainer.optimizers[0].defaults["fused"] is (clip is None)
+
+
 def learned_by_heart(name: str, start: nn.Module | None = None, lr: float = 3e-3, steps: int = 300) -> LitPoseRegressor:
     """Train on eight frames without dropout at a falling rate: the median errors end under 5 cm and 3 degrees.
 

@@ -7,6 +7,7 @@ from torchvision.models import GoogLeNet
 import mambaloc
 from mambaloc.benchmark.latency import random_frames
 from mambaloc.errors import InputError
+from mambaloc.export import contract_of, export_onnx
 from mambaloc.models.posenet import GoogLeNetBackbone
 
 SMALL = {"backbone": "mobilenetv3_small_050", "image_size": 64, "width": 32}
@@ -57,6 +58,35 @@ def test_googlenets_feature_is_that_of_torchvision(tmp_path):
 def test_googlenets_weights_that_are_not_there_are_named():
     with pytest.raises(InputError, match=r"backbone_weights nowhere.safetensors: no such file"):
         GoogLeNetBackbone("nowhere.safetensors")
+
+
+def test_googlenet_has_no_weights_of_timms():
+    with pytest.raises(InputError, match="GoogLeNet's are torchvision's"):
+        GoogLeNetBackbone("timm")
+
+
+def test_an_unknown_variant_is_named():
+    with pytest.raises(InputError, match=r"model\.variant 'googlnet': choose one of timm, googlenet"):
+        mambaloc.create_model("posenet", variant="googlnet")
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "kept"),
+    [
+        ("posenet_learned", {"s_position": -1.0}, ("l1", -1.0, -3.0)),
+        ("posenet_learned", None, ("l1", 0.0, -3.0)),
+        ("transbonet", {"nearest_sign": True}, ("l1", 0.0, -3.0)),
+    ],
+)
+def test_changing_one_loss_argument_leaves_the_others(name, given, kept):
+    loss = mambaloc.create_model(name, **SMALL, loss_args=given).loss
+    assert (loss.norm, loss.s_position.item(), loss.s_rotation.item()) == kept
+
+
+@pytest.mark.slow
+def test_googlenet_is_exported(googlenet, tmp_path):
+    contract = contract_of(googlenet, {"dataset": "7scenes", "scene": "heads", "short_side": 64})
+    assert export_onnx(googlenet, tmp_path / "model.onnx", contract).position_m < 1e-4
 
 
 # --- a warm start ----------------------------------------------------------------------------------------------------

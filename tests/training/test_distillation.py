@@ -124,8 +124,7 @@ def test_the_soft_loss_compares_positions_in_the_scenes_scale(teacher):
     assert normalised.position_m.tolist() == [[2.0, 1.0, 0.0]]
 
 
-def test_a_latent_of_another_width_is_projected_while_training_only(teacher, tmp_path):
-    assert isinstance(student_of(teacher).distillation.projection, torch.nn.Identity)  # 16 and 2 x 8
+def test_the_latent_feature_is_projected_while_training_only(teacher, tmp_path):
     system = student_of(teacher, width=12)
     assert system.distillation.projection.weight.shape == (16, 12)
     assert not any("projection" in n for n in read_checkpoint(saved(system, tmp_path / "a.ckpt"))["state_dict"])
@@ -175,6 +174,18 @@ def test_distillation_resumes_exactly(teacher, scenes, tmp_path):
     assert all(torch.equal(value, state[name]) for name, value in resumed.state_dict().items())
 
 
+@pytest.mark.slow
+def test_a_recipe_resumes_the_distillation(teacher, scenes, tmp_path):
+    recipe = distillation_recipe(teacher, scenes, tmp_path)
+    main([str(recipe), "--trainer.default_root_dir", str(tmp_path / "whole")])
+    main([str(recipe), "--trainer.max_epochs", "1"])
+    main([str(recipe), "--ckpt_path", str(tmp_path / "run/checkpoints/last.ckpt")])
+    whole, resumed = (read_checkpoint(tmp_path / run / "checkpoints/last.ckpt") for run in ("whole", "run"))
+    assert resumed["mambaloc"]["distilled"]["teacher"] == teacher
+    torch.testing.assert_close(resumed["state_dict"], whole["state_dict"], rtol=0, atol=0)
+    torch.testing.assert_close(resumed["distillation"], whole["distillation"], rtol=0, atol=0)
+
+
 def test_a_plain_students_checkpoint_resumes_no_distillation(teacher, scenes, tmp_path):
     path = saved(LitStudent(**SMALL), tmp_path / "student.ckpt")
     with pytest.raises(InputError, match=r"model\.warm_start"):
@@ -201,14 +212,18 @@ def test_mistakes_are_named(kwargs, message, teacher):
         student_of(**{"teacher": teacher, **kwargs})
 
 
-@pytest.mark.slow
-def test_a_recipe_distils_and_evaluates(teacher, scenes, tmp_path):
+def distillation_recipe(teacher, scenes, tmp_path):
     recipe = tmp_path / "distil.yaml"
     student = {"class_path": "LitDistillation", "init_args": {"teacher": teacher, "backbone": "resnet10t", "width": 16}}
     scene = {"root": str(scenes), "scene": "heads", "image_size": 32, "short_side": 36, "validation": "sequences"}
     trainer = {"max_epochs": 2, "accelerator": "cpu", "default_root_dir": str(tmp_path / "run")}
     recipe.write_text(yaml.safe_dump({"model": student, "data": scene, "trainer": trainer}))
-    main([str(recipe)])
+    return recipe
+
+
+@pytest.mark.slow
+def test_a_recipe_distils_and_evaluates(teacher, scenes, tmp_path):
+    main([str(distillation_recipe(teacher, scenes, tmp_path))])
     assert type(mambaloc.load(tmp_path / "run/checkpoints/last.ckpt")) is LitStudent
     assert (tmp_path / "run/evaluation/best/metrics.json").is_file()
     assert (tmp_path / "run/model.onnx").is_file()
