@@ -36,12 +36,17 @@ def decode_image(data: bytes) -> Image | str:
     return image[..., ::-1]  # type: ignore[return-value]
 
 
+def resized_size(size: tuple[int, int], short_side: int) -> tuple[int, int]:
+    """(height, width) of an image once its shorter side has so many pixels."""
+    scale = short_side / min(size)
+    return round(size[0] * scale), round(size[1] * scale)
+
+
 def resized(image: Image, short_side: int) -> Image:
     """Resize so that the shorter side has so many pixels, averaging areas where that is smaller."""
-    scale = short_side / min(image.shape[:2])
-    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    return cv2.resize(image, size, interpolation=how)  # type: ignore[return-value]
+    height, width = resized_size(image.shape[:2], short_side)
+    how = cv2.INTER_AREA if height < image.shape[0] else cv2.INTER_LINEAR
+    return cv2.resize(image, (width, height), interpolation=how)  # type: ignore[return-value]
 
 
 def center_cropped(image: Image, crop: tuple[int, int]) -> Image:

@@ -1,5 +1,7 @@
 """From a trained system to files that run without PyTorch."""
 
+from mambaloc.export.bundle import FORMATS, write_bundle
 from mambaloc.export.onnx import Parity, contract_of, export_onnx
+from mambaloc.export.precision import TARGETS
 
-__all__ = ["Parity", "contract_of", "export_onnx"]
+__all__ = ["FORMATS", "TARGETS", "Parity", "contract_of", "export_onnx", "write_bundle"]

@@ -11,6 +11,8 @@ from mambaloc.images import Image, center_cropped, resized
 
 VERSION = 1
 METADATA_KEY = "mambaloc"
+RAW_INPUT = "rgb"
+"""Name of the input of models that resize, crop and scale by themselves."""
 POSE = (
     "world_from_cam: camera centre in metres, unit quaternion wxyz with w >= 0; "
     "OpenCV camera axes (x right, y down, z forward)"
@@ -61,7 +63,7 @@ class Contract:
         height, width = self.preprocessing.crop
         raw = self.preprocessing.in_model
         tensor = {
-            "name": "image",
+            "name": RAW_INPUT if raw else "image",
             "dtype": "uint8" if raw else "float32",
             "shape": ["height", "width", 3] if raw else ["batch", 3, height, width],
             "range": [0, 255] if raw else [0, 1],

@@ -11,7 +11,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import Image, decode_image
+from mambaloc.images import Image, decode_image, resized_size
 from mambaloc.runtime.contract import METADATA_KEY, Contract
 
 _IN_A_BUNDLE = ("model.onnx", "model.fp16.onnx", "model.ort")
@@ -72,25 +72,21 @@ class Localiser:
         """
         rgb = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
         start = time.perf_counter()
-        position_m, quaternion = self._session.run(None, {"image": self._fed(rgb)})
+        position_m, quaternion = self._session.run(None, {self._session.get_inputs()[0].name: self._fed(rgb)})
         return Localisation(position_m[0], quaternion[0], time.perf_counter() - start)
 
     def _fed(self, rgb: Image) -> NDArray[np.generic]:
         preprocessing = self.contract.preprocessing
+        size = resized_size(rgb.shape[:2], preprocessing.short_side)
+        if size[0] < preprocessing.crop[0] or size[1] < preprocessing.crop[1]:
+            given, needed = (f"{width}x{height}" for height, width in (rgb.shape[:2], preprocessing.crop))
+            raise InputError(
+                f"image of {given}: resized to short side {preprocessing.short_side} it does not hold the model's crop "
+                f"of {needed}; give frames shaped as in training"
+            )
         if preprocessing.in_model:
             return np.ascontiguousarray(rgb)
-        try:
-            cropped = preprocessing.apply(rgb)
-        except Exception as error:  # cv2.error
-            raise InputError(f"image of {rgb.shape[1]}x{rgb.shape[0]}: cannot be resized ({error})") from None
-        if cropped.shape[:2] != preprocessing.crop:
-            width, height = rgb.shape[1], rgb.shape[0]
-            crop = "x".join(map(str, preprocessing.crop[::-1]))
-            raise InputError(
-                f"image of {width}x{height}: resized to short side {preprocessing.short_side} it does not hold the "
-                f"model's crop of {crop}; give frames shaped as in training"
-            )
-        return (cropped.transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32)
+        return (preprocessing.apply(rgb).transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32)
 
 
 def read_image(path: str | Path) -> Image:

@@ -43,7 +43,7 @@ def frames_of(source: str | Path) -> tuple[Iterator[SourceFrame], int | None]:
         return _of_capture(_opened(int(str(source)), f"camera {source}")), None
     path = Path(source)
     if path.is_dir():
-        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in _PICTURES)
+        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in _PICTURES and ".depth." not in p.name)
         if not pictures:
             raise InputError(f"{path}: holds no picture ({', '.join(_PICTURES)}); give a folder of them or a video")
         return _of_pictures(pictures), len(pictures)

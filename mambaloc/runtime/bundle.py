@@ -1,0 +1,100 @@
+"""A folder that an app ships: models, their contract, and frames with the poses that a port must find."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.runtime.localiser import Localiser
+
+CONTRACT_FILE = "contract.json"
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far one model of a bundle is from the system it was exported from, over the bundle's frames.
+
+    Args:
+        file: the model.
+        position_mm: largest difference of position.
+        rotation_deg: largest difference of rotation.
+        latency_ms: median of the frames.
+        within: whether both are at most what the bundle allows.
+    """
+
+    file: str
+    position_mm: float
+    rotation_deg: float
+    latency_ms: float
+    within: bool
+
+
+def verify_bundle(folder: Path, threads: int | None = None) -> list[Deviation]:
+    """Check every file's digest, and replay the frames through every model.
+
+    Raises:
+        InputError: where a file is missing or not the one that was written, or something cannot be read.
+    """
+    path = folder / CONTRACT_FILE
+    try:
+        bundle = json.loads(path.read_text(encoding="utf-8"))
+        files, frames = dict(bundle["files"]), list(bundle["frames"])
+        for name, entry in files.items():
+            _check(folder, name, entry["sha256"])
+        return list(_replayed(folder, files, frames, threads))
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); give a bundle's folder") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"{path}: is no bundle's contract ({reason}); write the bundle anew") from None
+
+
+def sha256(path: Path) -> str:
+    """Digest of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def rotation_deg(a: NDArray[np.floating[Any]], b: NDArray[np.floating[Any]]) -> float:
+    """Angle between two unit quaternions' rotations."""
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    near, far = sorted((np.linalg.norm(a - b), np.linalg.norm(a + b)))
+    return float(np.degrees(4 * np.arctan2(near, far)))
+
+
+def _check(folder: Path, name: str, digest: str) -> None:
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{folder / CONTRACT_FILE}: names {name}, outside of the bundle; do not use it")
+    if sha256(path) != digest:
+        raise InputError(f"{path}: is not the file that the bundle was written with (sha256 differs); get it anew")
+
+
+def _replayed(
+    folder: Path, files: dict[str, Any], frames: list[dict[str, Any]], threads: int | None
+) -> Iterator[Deviation]:
+    for name, entry in files.items():
+        if "allowed" not in entry:  # a frame
+            continue
+        localiser = Localiser(folder / name, threads)
+        found = [localiser.localise(folder / frame["file"]) for frame in frames]
+        position_mm = max(
+            1000 * float(np.linalg.norm(pose.position_m - np.array(frame["position_m"])))
+            for pose, frame in zip(found, frames, strict=True)
+        )
+        angle_deg = max(
+            rotation_deg(pose.quaternion, np.array(frame["quaternion_wxyz"]))
+            for pose, frame in zip(found, frames, strict=True)
+        )
+        allowed = entry["allowed"]
+        within = position_mm <= allowed["position_mm"] and angle_deg <= allowed["rotation_deg"]
+        latency_ms = 1000 * float(np.median([pose.latency_s for pose in found]))
+        yield Deviation(name, position_mm, angle_deg, latency_ms, within)

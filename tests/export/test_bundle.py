@@ -1,0 +1,181 @@
+"""Bundles: every model in them finds what PyTorch finds, and what was changed is found out."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mambaloc.data import PoseDataModule
+from mambaloc.errors import InputError
+from mambaloc.export import bundle as bundle_module
+from mambaloc.export import write_bundle
+from mambaloc.export.precision import half_precision
+from mambaloc.export.preprocessing import with_preprocessing
+from mambaloc.models.student import LitStudent
+from mambaloc.runtime import Localiser, Preprocessing
+from mambaloc.runtime.bundle import rotation_deg, verify_bundle
+
+
+@pytest.fixture(scope="module")
+def student():
+    torch.manual_seed(0)
+    system = LitStudent(backbone="resnet10t", width=16, image_size=(32, 40))
+    system.network.head.position_scale.fit(torch.randn(9, 3) + torch.tensor([300.0, 0.0, -40.0]))
+    system.provenance = {"commit": "abc", "versions": {"torch": "2"}}
+    return system
+
+
+@pytest.fixture(scope="module")
+def data(scenes):
+    return PoseDataModule("7scenes", str(scenes), "heads", image_size=(32, 40), short_side=36)
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["tensors", "pictures"])
+def bundle(request, student, data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bundles") / "new" / "bundle"
+    deviations = write_bundle(student, data, folder, ("onnx", "fp16", "ort"), raw_input=request.param)
+    return folder, deviations
+
+
+@pytest.mark.slow
+def test_every_model_finds_what_pytorch_finds(bundle):
+    folder, deviations = bundle
+    names = ["model.onnx", "model.fp16.onnx", "model.ort"]
+    assert [each.file for each in deviations] == names
+    assert [each.file for each in verify_bundle(folder)] == names
+    exact, half, ort = (each.position_mm for each in deviations)
+    assert exact < 1
+    assert ort < 1
+    assert half < 20  # 300 m from the origin, where float16 knows quarters of a metre
+    assert all(each.within for each in deviations)
+    assert not list(folder.parent.glob(".*"))
+
+
+@pytest.mark.slow
+def test_a_bundle_tells_an_app_what_it_needs(bundle):
+    folder, _ = bundle
+    contract = json.loads((folder / "contract.json").read_text())
+    raw = contract["preprocessing"]["in_model"]
+    assert contract["input"]["name"] == ("rgb" if raw else "image")
+    session = onnxruntime.InferenceSession(str(folder / "model.onnx"), providers=["CPUExecutionProvider"])
+    (tensor,) = session.get_inputs()
+    assert (tensor.name, tensor.type) == (contract["input"]["name"], "tensor(uint8)" if raw else "tensor(float)")
+    assert [o.name for o in session.get_outputs()] == list(contract["outputs"])
+    assert len(contract["frames"]) == 5
+    assert Localiser(folder).contract.scene == "7scenes/heads"
+    assert "Conv" in (folder / "required_operators_and_types.config").read_text()
+    assert (folder / "model.fp16.onnx").stat().st_size < 0.6 * (folder / "model.onnx").stat().st_size
+    card = (folder / "README.md").read_text()
+    assert "non-commercial" in card
+    assert "versions: torch 2" in card
+
+
+# --- preprocessing inside ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(480, 640), (640, 480), (97, 151), (40, 51), (36, 48)])
+def test_preprocessing_inside_is_that_outside(size):
+    preprocessing = Preprocessing(short_side=36, crop=(32, 34))
+    network = onnx.parser.parse_model(
+        '<ir_version: 10, opset_import: ["": 18]>'
+        "g (float[batch, 3, 32, 34] image) => (float[batch, 3, 32, 34] said) { said = Identity(image) }"
+    )
+    model = with_preprocessing(network, preprocessing)
+    onnx.checker.check_model(model)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    coarse = np.random.default_rng(0).integers(0, 256, (9, 12, 3), dtype=np.uint8)
+    rgb = cv2.resize(coarse, size[::-1], interpolation=cv2.INTER_CUBIC)
+    (inside,) = session.run(None, {"rgb": rgb})
+    outside = preprocessing.apply(rgb).transpose(2, 0, 1)
+    difference = np.abs(inside[0] * 255 - outside)
+    assert difference.max() <= 1.01  # a grey level, where rounding falls the other way
+    assert difference.mean() < 0.05
+
+
+# --- half precision ---------------------------------------------------------------------------------------------------
+
+
+def test_half_precision_leaves_the_scene_in_metres_alone():
+    """(x W) scaled to metres: the product before the last is halved, the last and the offset are not."""
+    model = onnx.parser.parse_model(
+        '<ir_version: 10, opset_import: ["": 18]>'
+        "g (float[1, 2] x) => (float[1, 2] position_m)"
+        "<float[2, 2] w = {1, 0, 0, 1}, float[2] metres = {312.3, -0.07}> {"
+        "a = MatMul(x, w) b = Relu(a) c = MatMul(b, w) position_m = Add(c, metres) }"
+    )
+    for number, node in enumerate(model.graph.node):
+        node.name = f"node_{number}"
+    half = half_precision(model)
+    onnx.checker.check_model(half)
+    types = {i.name: i.data_type for i in half.graph.initializer}
+    assert onnx.TensorProto.FLOAT16 in types.values()
+    session = onnxruntime.InferenceSession(half.SerializeToString(), providers=["CPUExecutionProvider"])
+    (found,) = session.run(None, {"x": np.array([[0.5, 0.25]], np.float32)})
+    np.testing.assert_allclose(found, [[312.8, 0.18]], atol=1e-4)  # float16 alone would say 312.75
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copied(bundle, tmp_path):
+    shutil.copytree(bundle[0], tmp_path / "bundle")
+    return tmp_path / "bundle"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["model.onnx", "model.ort", "frames/2.png"])
+def test_a_changed_byte_is_found_out(copied, name):
+    content = bytearray((copied / name).read_bytes())
+    content[len(content) // 2] ^= 1
+    (copied / name).write_bytes(content)
+    with pytest.raises(InputError, match="is not the file") as error:
+        verify_bundle(copied)
+    assert name in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_contract_that_is_none_is_refused(copied):
+    path = copied / "contract.json"
+    whole = json.loads(path.read_text())
+
+    def refused(content, message):
+        path.write_text(content)
+        with pytest.raises(InputError, match=message):
+            verify_bundle(copied)
+
+    refused("{", "is no bundle's contract")
+    refused("[]", "is no bundle's contract")
+    refused(json.dumps({**whole, "files": {"../model.onnx": {"sha256": ""}}}), "outside of the bundle")
+    refused(json.dumps({**whole, "files": {"gone.onnx": {"sha256": ""}}}), "gone.onnx: cannot be read")
+    refused(json.dumps({**whole, "frames": [{"file": "frames/0.png"}]}), "is no bundle's contract")
+    path.unlink()
+    with pytest.raises(InputError, match="give a bundle's folder"):
+        verify_bundle(copied)
+
+
+@pytest.mark.slow
+def test_a_model_that_deviates_is_not_shipped(student, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(bundle_module, "_ALLOWED", {"fp16": (0.0, 0.0)})
+    with pytest.raises(InputError, match=r"model\.fp16\.onnx: deviates by"):
+        write_bundle(student, data, tmp_path / "bundle", ("fp16",))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bundle_is_never_written_over(student, data, tmp_path):
+    with pytest.raises(InputError, match="is there already"):
+        write_bundle(student, data, tmp_path)
+
+
+def test_angles_against_scipy():
+    a, b = (Rotation.random(20, rng=seed) for seed in (0, 1))
+    expected = np.degrees((a.inv() * b).magnitude())
+    q, p = (r.as_quat(scalar_first=True) for r in (a, b))
+    np.testing.assert_allclose([rotation_deg(x, y) for x, y in zip(q, p, strict=True)], expected, atol=1e-9)
+    assert rotation_deg(q[0], -q[0]) == pytest.approx(0, abs=1e-9)

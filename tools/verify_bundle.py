@@ -1,0 +1,26 @@
+"""Replay a bundle's frames through its models: python tools/verify_bundle.py FOLDER [--threads N]. Needs no torch."""
+
+import argparse
+from pathlib import Path
+
+from mambaloc.console import exits_cleanly
+from mambaloc.errors import InputError
+from mambaloc.runtime.bundle import verify_bundle
+from mambaloc.runtime.report import print_deviations
+
+
+@exits_cleanly
+def main() -> None:
+    """Print each model's deviation; exit with code 2 where one is larger than the bundle allows."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("bundle", type=Path)
+    parser.add_argument("--threads", type=int, help="that one image may use")
+    args = parser.parse_args()
+    deviations = verify_bundle(args.bundle, args.threads)
+    print_deviations(deviations)
+    if bad := [each.file for each in deviations if not each.within]:
+        raise InputError(f"{args.bundle}: {', '.join(bad)} deviates more than allowed; export the bundle anew")
+
+
+if __name__ == "__main__":
+    main()
