@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mambaloc.data import PoseDataModule
-    from mambaloc.models import create_model, list_models, load
+    from mambaloc.models import create_model, list_models
     from mambaloc.models.mambaloc import LitMambaLoc
+    from mambaloc.zoo import load
 
 __version__ = version("mambaloc")
 
@@ -23,7 +24,7 @@ _EXPORTS = {
     "PoseDataModule": "mambaloc.data",
     "create_model": "mambaloc.models",
     "list_models": "mambaloc.models",
-    "load": "mambaloc.models",
+    "load": "mambaloc.zoo",
 }
 
 __all__ = ["LitMambaLoc", "PoseDataModule", "__version__", "create_model", "list_models", "load"]

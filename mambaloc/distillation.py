@@ -11,9 +11,10 @@ from torch import Tensor, nn
 
 from mambaloc.errors import InputError
 from mambaloc.losses import Soft, SoftTargets, cosine_distance
-from mambaloc.models import LitPoseRegressor, load
+from mambaloc.models import LitPoseRegressor
 from mambaloc.models.student import LitStudent, Student
 from mambaloc.types import PoseBatch, PosePrediction
+from mambaloc.zoo import load
 
 _OWN = ("teacher", "hard_weight", "soft_weight", "feature_weight", "soft", "soft_args", "cache_teacher")
 _PREFIX = "distillation."
@@ -95,7 +96,8 @@ class LitDistillation(LitStudent):
     The other arguments are those of :class:`~mambaloc.models.student.LitStudent`.
 
     Args:
-        teacher: checkpoint of any system; it normalises images and positions in its own way.
+        teacher: any system, as :func:`mambaloc.load` takes it: a checkpoint or the name of a released model. It
+            normalises images and positions in its own way.
         hard_weight: of the loss against true poses; 0 switches it off.
         soft_weight: likewise.
         feature_weight: likewise.

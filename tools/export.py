@@ -7,7 +7,7 @@ from mambaloc.console import exits_cleanly, quieten
 from mambaloc.errors import InputError
 from mambaloc.evaluation.evaluate import data_of
 from mambaloc.export import FORMATS, TARGETS, write_bundle
-from mambaloc.models import load
+from mambaloc.models import load_checkpoint
 from mambaloc.models.base import read_checkpoint
 from mambaloc.runtime.report import print_deviations
 
@@ -29,7 +29,7 @@ def main() -> None:
     stored = read_checkpoint(args.checkpoint)
     out = args.out or args.checkpoint.parent.parent / "bundle"
     data = data_of(stored, args.checkpoint)
-    print_deviations(write_bundle(load(args.checkpoint), data, out, formats, args.target, args.raw_input))
+    print_deviations(write_bundle(load_checkpoint(args.checkpoint), data, out, formats, args.target, args.raw_input))
     print(f"wrote {out}")
 
 

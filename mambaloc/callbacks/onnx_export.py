@@ -8,7 +8,7 @@ import lightning as L
 from lightning.pytorch.utilities import rank_zero_info
 
 from mambaloc.export import contract_of, export_onnx
-from mambaloc.models import LitPoseRegressor, load
+from mambaloc.models import LitPoseRegressor, load_checkpoint
 
 
 class OnnxExport(L.Callback):
@@ -28,6 +28,6 @@ class OnnxExport(L.Callback):
         assert isinstance(pl_module, LitPoseRegressor)
         best = getattr(trainer.checkpoint_callback, "best_model_path", "")
         path = Path(trainer.default_root_dir) / "model.onnx"
-        system = load(best) if best else pl_module
+        system = load_checkpoint(best) if best else pl_module
         parity = export_onnx(system, path, contract_of(system, trainer.datamodule.hparams))  # type: ignore[attr-defined]
         rank_zero_info(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch")

@@ -17,7 +17,7 @@ from mambaloc.errors import InputError
 from mambaloc.evaluation.references import median_training_pose
 from mambaloc.evaluation.trajectories import write_csv
 from mambaloc.metrics import PoseErrorTable, summarise
-from mambaloc.models import LitPoseRegressor, load
+from mambaloc.models import LitPoseRegressor, load_checkpoint
 from mambaloc.models.base import mib, parameter_count, read_checkpoint
 from mambaloc.runtime.trajectory import write_tum
 from mambaloc.viz import draw_trajectory
@@ -43,21 +43,12 @@ def evaluate_checkpoint(
         InputError: for a bad checkpoint, missing or bad data, or a folder that cannot be written.
     """
     stored = read_checkpoint(checkpoint)
-    system = load(checkpoint)
+    system = load_checkpoint(checkpoint)
     data = data or data_of(stored, checkpoint)
     check_image_size(system, data, checkpoint)
-    trainer = L.Trainer(
-        accelerator=accelerator,
-        devices=1,
-        logger=False,
-        enable_checkpointing=False,
-        enable_model_summary=False,
-        enable_progress_bar=False,
-    )
     started = time.perf_counter()
-    trainer.test(system, datamodule=data, verbose=False)
+    table = localise_test_frames(system, data, accelerator)
     seconds = time.perf_counter() - started
-    table = system.test_errors.table()
     result = {
         "metrics": summarise(table),
         "count": len(table.index),
@@ -77,6 +68,20 @@ def evaluate_checkpoint(
     }
     _write(out, result, table, data)
     return result
+
+
+def localise_test_frames(system: LitPoseRegressor, data: PoseDataModule, accelerator: str = "auto") -> PoseErrorTable:
+    """Let a system localise every test frame, once and on one device."""
+    trainer = L.Trainer(
+        accelerator=accelerator,
+        devices=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        enable_progress_bar=False,
+    )
+    trainer.test(system, datamodule=data, verbose=False)
+    return system.test_errors.table()
 
 
 def data_of(stored: dict[str, Any], checkpoint: Path) -> PoseDataModule:

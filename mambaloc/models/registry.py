@@ -54,7 +54,7 @@ def create_model(name: str, **kwargs: Any) -> LitPoseRegressor:
     return model_class(name)(**kwargs)
 
 
-def load(path: str | Path) -> LitPoseRegressor:
+def load_checkpoint(path: str | Path) -> LitPoseRegressor:
     """Load a trained system from a checkpoint, whichever system it is, in evaluation mode on the CPU.
 
     Raises:

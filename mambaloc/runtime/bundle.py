@@ -63,6 +63,11 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def sha256_of(content: bytes) -> str:
+    """Digest of a file's content."""
+    return hashlib.sha256(content).hexdigest()
+
+
 def rotation_deg(a: NDArray[np.floating[Any]], b: NDArray[np.floating[Any]]) -> float:
     """Angle between two unit quaternions' rotations."""
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)

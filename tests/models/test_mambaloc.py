@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
 from mambaloc.errors import InputError
-from mambaloc.models import load
+from mambaloc.models import load_checkpoint
 from mambaloc.models.base import mib, parameter_count
 from mambaloc.models.mambaloc import LitMambaLoc, MambaLoc
 from mambaloc.nn import PositionScale
@@ -227,7 +227,7 @@ def test_position_statistics_are_taken_from_training_and_saved(tmp_path, normali
     run = trainer(tmp_path)
     run.fit(system, datamodule=scene)
     run.save_checkpoint(tmp_path / "last.ckpt")
-    mean_m = load(tmp_path / "last.ckpt").network.head.position_scale.mean_m
+    mean_m = load_checkpoint(tmp_path / "last.ckpt").network.head.position_scale.mean_m
     assert_close(mean_m, scene.train_position_m.mean(0) if normalise else torch.zeros(3))
 
 
@@ -250,5 +250,5 @@ def test_backbone_weights_are_not_looked_for_again(tmp_path):
     run.strategy.connect(system)
     run.save_checkpoint(tmp_path / "last.ckpt")
     weights.unlink()
-    loaded = load(tmp_path / "last.ckpt")
+    loaded = load_checkpoint(tmp_path / "last.ckpt")
     assert all(torch.equal(v, loaded.state_dict()[k]) for k, v in system.state_dict().items())

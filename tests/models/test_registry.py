@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 import mambaloc
 from mambaloc.errors import InputError
-from mambaloc.models import LitPoseRegressor, create_model, list_models, load, register_model, registry
+from mambaloc.models import LitPoseRegressor, create_model, list_models, load_checkpoint, register_model, registry
 from mambaloc.models.base import read_checkpoint
 from mambaloc.models.mambaloc import LitMambaLoc
 from mambaloc.types import PosePrediction
@@ -91,7 +91,7 @@ def test_a_system_without_a_network_is_named():
 
 
 def test_the_package_offers_the_registry():
-    assert (mambaloc.list_models, mambaloc.create_model, mambaloc.load) == (list_models, create_model, load)
+    assert (mambaloc.list_models, mambaloc.create_model) == (list_models, create_model)
     assert mambaloc.LitMambaLoc is LitMambaLoc
     with pytest.raises(AttributeError, match="no_such_thing"):
         mambaloc.no_such_thing
@@ -106,7 +106,7 @@ def test_load_finds_the_class_of_a_checkpoint(tmp_path):
     for name, kwargs in {"mean": {"gain": 2.0, "lr": 0.5}, "mambaloc": small}.items():
         system = create_model(name, **kwargs)
         save(system, tmp_path / f"{name}.ckpt")
-        loaded = load(tmp_path / f"{name}.ckpt")
+        loaded = load_checkpoint(tmp_path / f"{name}.ckpt")
         assert type(loaded) is type(system)
         assert not loaded.training
         assert {k: loaded.hparams[k] for k in kwargs} == kwargs
@@ -120,7 +120,7 @@ def test_a_checkpoint_of_a_system_that_is_not_here_is_refused(tmp_path):
     save(create_model("mean_place"), tmp_path / "last.ckpt")
     del registry._MODELS["mean_place"]
     with pytest.raises(InputError, match="mean_place"):
-        load(tmp_path / "last.ckpt")
+        load_checkpoint(tmp_path / "last.ckpt")
 
 
 class Malicious:
@@ -147,7 +147,7 @@ def write_pickle(value, path) -> None:
 
 READERS = pytest.mark.parametrize(
     "read",
-    [load, read_checkpoint, LitMambaLoc.load_from_checkpoint,
+    [load_checkpoint, read_checkpoint, LitMambaLoc.load_from_checkpoint,
      lambda path: LitMambaLoc.load_from_checkpoint(path, weights_only=False)],
     ids=["load", "read_checkpoint", "load_from_checkpoint", "asked_for_pickles"],
 )  # fmt: skip

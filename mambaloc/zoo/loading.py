@@ -1,0 +1,89 @@
+"""Load a trained system from wherever it is: a checkpoint, a released model's name, a folder, a hub."""
+
+from __future__ import annotations
+
+import sys
+from difflib import get_close_matches
+from pathlib import Path
+
+from huggingface_hub import snapshot_download
+from safetensors import SafetensorError
+from safetensors.torch import load as tensors_of
+
+from mambaloc import models
+from mambaloc.errors import InputError
+from mambaloc.models import LitPoseRegressor, create_model
+from mambaloc.runtime.bundle import sha256_of
+from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest
+
+_ZOOS = (Path(__file__).parents[2] / "zoo", Path(sys.prefix) / "share/mambaloc/zoo")
+"""A checkout's, and an installation's."""
+
+_SOURCES = "give a checkpoint, 'ARCH.TAG' (see list_released()), 'local-dir:FOLDER', or 'hf-hub:ORG/NAME@REVISION'"
+
+
+def list_released() -> list[str]:
+    """Names of the released models that are here, ``ARCH.TAG``, sorted."""
+    return sorted({manifest.parent.name for zoo in _ZOOS for manifest in zoo.glob(f"*/{MANIFEST_FILE}")})
+
+
+def load(source: str | Path) -> LitPoseRegressor:
+    """Load a trained system in evaluation mode on the CPU; nothing is ever unpickled but plain tensors.
+
+    Args:
+        source: ``RUN/checkpoints/best.ckpt``; ``ARCH.TAG`` of a released model; ``local-dir:FOLDER`` with a manifest;
+            or ``hf-hub:ORG/NAME@REVISION``, which is kept and found again without a network.
+
+    Raises:
+        InputError: where there is no such model, its manifest or digest is wrong, or it is of another architecture.
+    """
+    kind, colon, rest = str(source).partition(":")
+    if colon and kind == "local-dir":
+        return load_released(Path(rest))
+    if colon and kind == "hf-hub":
+        return load_released(_from_hub(rest))
+    if Path(source).suffix == ".ckpt" or Path(source).is_file():
+        return models.load_checkpoint(source)
+    if found := next((zoo / str(source) for zoo in _ZOOS if (zoo / str(source) / MANIFEST_FILE).is_file()), None):
+        return load_released(found)
+    near = get_close_matches(str(source), list_released(), n=3)
+    raise InputError(f"{source}: no such model; " + (f"did you mean {', '.join(near)}?" if near else _SOURCES))
+
+
+def load_released(folder: Path) -> LitPoseRegressor:
+    """Load the model that a manifest speaks of.
+
+    Raises:
+        InputError: as :func:`load`.
+    """
+    manifest, path = Manifest.read(folder), folder / WEIGHTS_FILE
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); get the model anew") from None
+    if sha256_of(content) != manifest.weights_sha256:
+        raise InputError(f"{path}: is not the file that its manifest speaks of (sha256 differs); get the model anew")
+    try:
+        system = create_model(manifest.model, **{**manifest.arguments, "backbone_weights": None, "warm_start": None})
+        system.network.load_state_dict(tensors_of(content))
+    except (SafetensorError, RuntimeError, TypeError, ValueError) as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise InputError(f"{path}: does not fit {manifest.model} as the manifest describes it ({reason})") from None
+    system.provenance = dict(manifest.trained)
+    return system.eval()
+
+
+def _from_hub(name: str) -> Path:
+    repository, at, revision = name.partition("@")
+    if not at or not revision:
+        raise InputError(f"hf-hub:{name}: names no revision, so it may change; give hf-hub:{repository}@REVISION")
+    files = [MANIFEST_FILE, WEIGHTS_FILE]
+    try:
+        return Path(snapshot_download(repository, revision=revision, allow_patterns=files))
+    except Exception as online:  # the hub's client raises its own errors, its transport's, and the system's
+        try:
+            kept = snapshot_download(repository, revision=revision, allow_patterns=files, local_files_only=True)
+            return Path(kept)
+        except Exception:
+            reason = f"{type(online).__name__}: {str(online).splitlines()[0]}" if str(online) else type(online).__name__
+            raise InputError(f"hf-hub:{name}: cannot be fetched, and is not kept from before ({reason})") from None

@@ -1,0 +1,130 @@
+"""The manifest of a released model: architecture, weights, input, provenance, and figures with where they are from."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mambaloc.errors import InputError
+
+VERSION = 1
+MANIFEST_FILE = "manifest.yaml"
+WEIGHTS_FILE = "weights.safetensors"
+
+
+@dataclass(frozen=True)
+class Result:
+    """Median errors over a set of frames; none of the other fields may be missing.
+
+    Args:
+        data: dataset and scene.
+        official_split: whether these are the frames of the benchmark of that name.
+        split: which frames.
+        selection: how the epoch was chosen.
+        n: frames.
+        position_error_m: median.
+        rotation_error_deg: median.
+        seed: of the training.
+        commit: that was evaluated with.
+        device: likewise.
+        seconds: of training alone.
+    """
+
+    data: str
+    official_split: bool
+    split: str
+    selection: str
+    n: int
+    position_error_m: float
+    rotation_error_deg: float
+    seed: int
+    commit: str
+    device: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What ``manifest.yaml`` says.
+
+    Args:
+        model: registry name of the system.
+        arguments: its hyperparameters.
+        scene: dataset and scene that it knows.
+        short_side: what images are resized to before the crop, whose size is the system's own.
+        pose: frame, units and order of what it says.
+        weights_sha256: digest of ``weights.safetensors``, parameters and buffers.
+        weights_bytes: its size.
+        trained: commit, seed, device and versions of the training, and its recipe's digest.
+        results: measured errors.
+        licence: of the weights.
+    """
+
+    model: str
+    arguments: dict[str, Any]
+    scene: str
+    short_side: int
+    pose: str
+    weights_sha256: str
+    weights_bytes: int
+    trained: dict[str, Any]
+    results: tuple[Result, ...]
+    licence: str
+
+    def to_yaml(self) -> str:
+        """Write it down."""
+        data = {"manifest": VERSION, **asdict(self), "results": [asdict(result) for result in self.results]}
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=120)
+
+    @classmethod
+    def read(cls, folder: Path) -> Manifest:
+        """Read a released model's manifest.
+
+        Raises:
+            InputError: where it is missing or not one, or gives a figure without its provenance.
+        """
+        path = folder / MANIFEST_FILE
+        try:
+            data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); give a released model's folder") from None
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); get it anew") from None
+        if not isinstance(data, dict) or data.pop("manifest", None) != VERSION:
+            raise InputError(f"{path}: is no manifest of version {VERSION}; publish the model anew")
+        _check(path, "manifest", data, cls)
+        results = [_checked_result(path, number, entry) for number, entry in enumerate(data.pop("results"), start=1)]
+        return cls(results=tuple(results), **data)
+
+
+_KINDS: dict[str, Any] = {
+    "str": str,
+    "int": int,
+    "float": (int, float),
+    "bool": bool,
+    "dict[str, Any]": dict,
+    "tuple[Result, ...]": list,
+}
+
+
+def _checked_result(path: Path, number: int, entry: Any) -> Result:
+    if not isinstance(entry, dict):
+        raise InputError(f"{path}: result {number} is no mapping; publish the model anew")
+    _check(path, f"result {number}", entry, Result)
+    return Result(**entry)
+
+
+def _check(path: Path, what: str, data: dict[str, Any], kind: type) -> None:
+    """Every field there, of its type and not empty, and no other."""
+    expected = {field.name: _KINDS[str(field.type)] for field in fields(kind)}
+    if missing := [name for name in expected if data.get(name) in (None, "")]:
+        raise InputError(f"{path}: {what} lacks {', '.join(missing)}; nothing is told without where it came from")
+    if unknown := sorted(set(map(str, data)) - set(expected)):
+        raise InputError(f"{path}: {what} has {', '.join(unknown)}, which no manifest has; publish the model anew")
+    for name, types in expected.items():
+        value = data[name]
+        if not isinstance(value, types) or (isinstance(value, bool) and types is not bool):
+            raise InputError(f"{path}: {what}'s {name} is {value!r}; publish the model anew")

@@ -1,0 +1,152 @@
+"""Release a trained system: safetensors, manifest and card, re-measured from what was written."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from safetensors.torch import save
+
+from mambaloc.data.download.origins import SOURCES
+from mambaloc.errors import InputError
+from mambaloc.evaluation import evaluate_checkpoint
+from mambaloc.evaluation.evaluate import data_of, localise_test_frames
+from mambaloc.metrics import summarise
+from mambaloc.models import load_checkpoint
+from mambaloc.models.base import read_checkpoint
+from mambaloc.runtime.bundle import sha256_of
+from mambaloc.runtime.contract import POSE
+from mambaloc.zoo.loading import load_released
+from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest, Result
+
+CARD_FILE = "README.md"
+_STARTS = ("backbone_weights", "warm_start")  # the released weights are whole
+_OWN_LICENCE = "Apache-2.0"  # of weights trained on frames that the project renders itself
+
+
+def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
+    """Measure a checkpoint, write it as ``ZOO/ARCH.TAG``, and measure again what was written.
+
+    Args:
+        checkpoint: of a training run, whose data is still there.
+        tag: of the model's name, such as ``7scenes_heads``.
+        zoo: the folder that released models are in.
+        accelerator: as Lightning's Trainer takes it.
+
+    Returns:
+        The model's folder; it appears once both measurements agree.
+
+    Raises:
+        InputError: for a bad name, a name that is taken, a result without provenance, or measurements that differ.
+    """
+    stored = read_checkpoint(checkpoint)
+    folder = zoo / f"{stored['mambaloc']['model']}.{tag}"
+    if not re.fullmatch(r"[a-z0-9_]+", tag):
+        raise InputError(f"--tag {tag}: lower-case letters, digits and underscores make a tag; choose another")
+    if folder.exists():
+        raise InputError(f"{folder}: is released already; choose another tag")
+    system, data = load_checkpoint(checkpoint), data_of(stored, checkpoint)
+    partial = folder.with_name(f".{folder.name}.partial")
+    try:
+        with TemporaryDirectory() as scratch:
+            measured = evaluate_checkpoint(checkpoint, Path(scratch), data, accelerator)
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        weights = save({name: tensor.contiguous().cpu() for name, tensor in system.network.state_dict().items()})
+        manifest = Manifest(
+            model=system.registry_name,
+            arguments={
+                k: v for k, v in _plain(dict(system.hparams)).items() if not k.startswith("_") and k not in _STARTS
+            },
+            scene=f"{data.hparams['dataset']}/{measured['data']['scene']}",
+            short_side=data.hparams["short_side"],
+            pose=POSE,
+            weights_sha256=sha256_of(weights),
+            weights_bytes=len(weights),
+            trained=_plain({**stored["mambaloc"], "recipe_sha256": measured["training"]["recipe_sha256"]}),
+            results=(_result(measured),),
+            licence=_licence(data.hparams["dataset"]),
+        )
+        (partial / WEIGHTS_FILE).write_bytes(weights)
+        (partial / MANIFEST_FILE).write_text(manifest.to_yaml(), encoding="utf-8")
+        (partial / CARD_FILE).write_text(card(folder.name, manifest), encoding="utf-8")
+        _agree(partial, measured, data_of(stored, checkpoint), accelerator)
+        partial.replace(folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --zoo") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return folder
+
+
+def card(name: str, manifest: Manifest) -> str:
+    """A model card in Markdown."""
+    rows = "\n".join(
+        f"| {r.data}{'' if r.official_split else ' (no official split)'}, {r.split}, {r.n} frames | {r.selection} | "
+        f"{r.position_error_m:.3f} m | {r.rotation_error_deg:.2f}° | {r.seed} | {r.seconds:.0f} s | {r.device} | "
+        f"{r.commit[:7]} |"
+        for r in manifest.results
+    )
+    trained = "\n".join(f"- {key}: {value}" for key, value in manifest.trained.items() if not isinstance(value, dict))
+    return f"""# {name}
+
+`mambaloc.load("{name}")`: {manifest.model}, which knows the scene {manifest.scene} and no other.
+
+{manifest.pose}. Images are resized to a short side of {manifest.short_side} pixels and cropped in the middle to
+{"x".join(map(str, manifest.arguments["image_size"][::-1]))}. {manifest.weights_bytes / 2**20:.2f} MiB, float32.
+
+| data | epoch | median position | median rotation | seed | training | device | commit |
+|---|---|---|---|---|---|---|---|
+{rows}
+
+## Trained
+
+{trained}
+
+## Licence
+
+{manifest.licence}
+"""
+
+
+def _result(measured: dict[str, Any]) -> Result:
+    data, metrics, training = measured["data"], measured["metrics"], measured["training"]
+    commit, clock = measured["evaluation"]["commit"], training["wall_clock"]
+    if commit is None or clock is None:
+        raise InputError("no result without provenance: publish from a checkout, and a training of tools/train.py")
+    return Result(
+        data=f"{data['dataset']}/{data['scene']}",
+        official_split=bool(data["official_split"]),
+        split=measured["split"],
+        selection=f"{measured['selection']}, epoch {training['epoch']}",
+        n=measured["count"],
+        position_error_m=round(metrics["position_error_m"], 6),
+        rotation_error_deg=round(metrics["rotation_error_deg"], 6),
+        seed=training["seed"],
+        commit=commit,
+        device=measured["evaluation"]["device"],
+        seconds=round(clock["train_s"], 1),
+    )
+
+
+def _agree(folder: Path, measured: dict[str, Any], data: Any, accelerator: str) -> None:
+    """Refuse what does not find again what was measured."""
+    again = summarise(localise_test_frames(load_released(folder), data, accelerator))
+    before = measured["metrics"]
+    for name in ("position_error_m", "rotation_error_deg"):
+        if not abs(again[name] - before[name]) <= 1e-3 * max(1.0, before[name]):
+            raise InputError(f"{folder}: {name} is {again[name]}, where the checkpoint's was {before[name]}; report it")
+
+
+def _licence(dataset: str) -> str:
+    source = SOURCES.get(dataset)
+    return f"{source.title}'s: {source.licence}; {source.terms}" if source else _OWN_LICENCE
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """As YAML's safe subset: tuples become lists."""
+    return json.loads(json.dumps(values))

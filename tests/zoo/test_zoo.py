@@ -1,0 +1,181 @@
+"""Publishing, and loading from everywhere, on a tiny training."""
+
+import pickle
+import shutil
+
+import pytest
+import torch
+import yaml
+
+import mambaloc
+from mambaloc.cli import main
+from mambaloc.errors import InputError
+from mambaloc.models.mambaloc import LitMambaLoc
+from mambaloc.zoo import Manifest, list_released, load, publish
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, scenes):
+    folder = tmp_path_factory.mktemp("run")
+    recipe = folder / "recipe.yaml"
+    model = {"backbone": "resnet10t", "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "head_hidden": 16}
+    data = {"root": str(scenes), "scene": "heads", "image_size": [32, 36], "short_side": 36, "validation": "sequences"}
+    trainer = {"max_epochs": 2, "accelerator": "cpu", "default_root_dir": str(folder / "run")}
+    system = {"class_path": "LitMambaLoc", "init_args": {**model, "normalise_position": True}}
+    content = {"model": system, "data": data, "trainer": trainer, "onnx_export": {"enabled": False}}
+    recipe.write_text(yaml.safe_dump(content))
+    main([str(recipe)])
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def released(run, tmp_path_factory):
+    return publish(run / "checkpoints/best.ckpt", "tiny", tmp_path_factory.mktemp("zoo"), "cpu")
+
+
+@pytest.fixture
+def copy(released, tmp_path):
+    return shutil.copytree(released, tmp_path / released.name)
+
+
+pytestmark = pytest.mark.slow
+
+
+def test_what_is_released_is_what_was_trained(run, released):
+    system, checkpoint = load(f"local-dir:{released}"), mambaloc.load(run / "checkpoints/best.ckpt")
+    assert type(system) is LitMambaLoc
+    assert not system.training
+    image = torch.rand(2, 3, 32, 36)
+    with torch.no_grad():
+        assert torch.equal(system(image).position_m, checkpoint(image).position_m)
+        assert torch.equal(system(image).quaternion, checkpoint(image).quaternion)
+    assert system.provenance["commit"] == checkpoint.provenance["commit"]
+
+
+def test_every_figure_says_where_it_is_from(released):
+    manifest = Manifest.read(released)
+    (result,) = manifest.results
+    assert (result.data, result.split, result.n, result.seed) == ("7scenes/heads", "test", 8, 0)
+    assert result.selection.startswith("best: lowest val/loss on frames held out")
+    assert result.official_split is False
+    assert result.seconds > 0
+    assert len(result.commit) >= 40
+    assert manifest.trained["recipe_sha256"]
+    assert manifest.weights_bytes == (released / "weights.safetensors").stat().st_size
+    assert "non-commercial" in manifest.licence
+    card = (released / "README.md").read_text()
+    assert f"{result.position_error_m:.3f} m" in card
+    assert "no official split" in card
+
+
+def test_a_name_finds_it(released, monkeypatch):
+    monkeypatch.setattr("mambaloc.zoo.loading._ZOOS", (released.parent,))
+    assert list_released() == ["mambaloc.tiny"]
+    assert type(mambaloc.load("mambaloc.tiny")) is LitMambaLoc
+    with pytest.raises(InputError, match=r"mambaloc\.tin: no such model; did you mean mambaloc\.tiny"):
+        mambaloc.load("mambaloc.tin")
+    with pytest.raises(InputError, match="hf-hub:ORG/NAME@REVISION"):
+        mambaloc.load("something else")
+
+
+def test_the_hub_is_asked_for_one_revision_and_remembers(released, monkeypatch):
+    asked = []
+
+    def online(repository, revision, allow_patterns, local_files_only=False):
+        asked.append((repository, revision, local_files_only))
+        if "offline" in repository and not local_files_only:
+            raise ConnectionError("no network")
+        if "nowhere" in repository:
+            raise FileNotFoundError("not kept")
+        return str(released)
+
+    monkeypatch.setattr("mambaloc.zoo.loading.snapshot_download", online)
+    assert type(load("hf-hub:org/name@abc")) is LitMambaLoc
+    assert type(load("hf-hub:org/offline@abc")) is LitMambaLoc
+    assert asked == [("org/name", "abc", False), ("org/offline", "abc", False), ("org/offline", "abc", True)]
+    with pytest.raises(InputError, match="names no revision"):
+        load("hf-hub:org/name")
+    with pytest.raises(InputError, match=r"cannot be fetched.*no network"):
+        load("hf-hub:org/offline-nowhere@abc")
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def refused(folder, message):
+    with pytest.raises(InputError, match=message) as error:
+        load(f"local-dir:{folder}")
+    assert "\n" not in str(error.value)
+
+
+def test_changed_weights_are_refused(copy):
+    weights = copy / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    refused(copy, "sha256 differs")
+    weights.unlink()
+    refused(copy, "cannot be read")
+
+
+def test_a_pickle_in_place_of_weights_is_not_opened(copy):
+    import hashlib
+
+    class Trap:
+        def __reduce__(self):
+            return pytest.fail, ("the pickle was opened",)
+
+    content = pickle.dumps(Trap())
+    (copy / "weights.safetensors").write_bytes(content)
+    manifest = yaml.safe_load((copy / "manifest.yaml").read_text())
+    manifest["weights_sha256"] = hashlib.sha256(content).hexdigest()
+    (copy / "manifest.yaml").write_text(yaml.safe_dump(manifest))
+    refused(copy, "does not fit mambaloc")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m["results"][0].pop("commit"), "result 1 lacks commit; nothing is told without"),
+        (lambda m: m["results"][0].update(seconds=None), "result 1 lacks seconds"),
+        (lambda m: m["results"][0].update(n="many"), "n is 'many'"),
+        (lambda m: m.update(results=["0.1 m"]), "result 1 is no mapping"),
+        (lambda m: m.pop("licence"), "lacks licence"),
+        (lambda m: m.update(extra=1), "has extra"),
+        (lambda m: m.update(manifest=2), "no manifest of version 1"),
+        (lambda m: m.update(model="mambalock"), "mambalock"),
+        (lambda m: m["arguments"].update(dim=32), "does not fit"),
+        (lambda m: m["arguments"].update(dime=32), "does not fit"),
+    ],
+)
+def test_manifests_are_checked(change, message, copy):
+    manifest = yaml.safe_load((copy / "manifest.yaml").read_text())
+    change(manifest)
+    (copy / "manifest.yaml").write_text(yaml.safe_dump(manifest))
+    refused(copy, message)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"{", b"[]", b"!!python/object/apply:os.system [ls]"])
+def test_what_is_no_manifest(content, copy):
+    (copy / "manifest.yaml").write_bytes(content)
+    refused(copy, "manifest.yaml")
+
+
+def test_a_name_is_not_taken_twice_nor_made_up(run, released):
+    with pytest.raises(InputError, match="is released already"):
+        publish(run / "checkpoints/best.ckpt", "tiny", released.parent, "cpu")
+    with pytest.raises(InputError, match="choose another"):
+        publish(run / "checkpoints/best.ckpt", "../tiny", released.parent, "cpu")
+
+
+def test_what_does_not_measure_the_same_is_not_released(run, tmp_path, monkeypatch):
+    def other(folder):
+        system = mambaloc.load(run / "checkpoints/best.ckpt")
+        with torch.no_grad():
+            system.network.head.position[0].bias.add_(5)
+        return system
+
+    monkeypatch.setattr("mambaloc.zoo.publishing.load_released", other)
+    with pytest.raises(InputError, match="where the checkpoint's was"):
+        publish(run / "checkpoints/best.ckpt", "tiny", tmp_path / "zoo", "cpu")
+    assert not list((tmp_path / "zoo").iterdir())

@@ -1,0 +1,24 @@
+"""Release a model: python tools/publish.py CHECKPOINT --tag TAG [--zoo zoo]."""
+
+import argparse
+from pathlib import Path
+
+from mambaloc.console import exits_cleanly, quieten
+from mambaloc.zoo import publish
+
+
+@exits_cleanly
+def main() -> None:
+    """Measure, write, read back, measure again."""
+    quieten()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--tag", required=True, help="of its name, ARCH.TAG")
+    parser.add_argument("--zoo", type=Path, default=Path("zoo"), help="folder of released models")
+    args = parser.parse_args()
+    folder = publish(args.checkpoint, args.tag, args.zoo)
+    print(f"{folder}: manifest.yaml, weights.safetensors, README.md")
+
+
+if __name__ == "__main__":
+    main()
