@@ -20,6 +20,7 @@ from mambaloc.models import load_checkpoint
 from mambaloc.models.base import read_checkpoint
 from mambaloc.runtime.bundle import sha256_of
 from mambaloc.runtime.contract import POSE
+from mambaloc.types import height_and_width
 from mambaloc.zoo.loading import load_released
 from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest, Result
 
@@ -92,12 +93,13 @@ def card(name: str, manifest: Manifest) -> str:
         for r in manifest.results
     )
     trained = "\n".join(f"- {key}: {value}" for key, value in manifest.trained.items() if not isinstance(value, dict))
+    height, width = height_and_width(manifest.arguments["image_size"])
     return f"""# {name}
 
 `mambaloc.load("{name}")`: {manifest.model}, which knows the scene {manifest.scene} and no other.
 
 {manifest.pose}. Images are resized to a short side of {manifest.short_side} pixels and cropped in the middle to
-{"x".join(map(str, manifest.arguments["image_size"][::-1]))}. {manifest.weights_bytes / 2**20:.2f} MiB, float32.
+{width}x{height}. {manifest.weights_bytes / 2**20:.2f} MiB, float32.
 
 | data | epoch | median position | median rotation | seed | training | device | commit |
 |---|---|---|---|---|---|---|---|

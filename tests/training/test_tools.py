@@ -1,0 +1,83 @@
+"""From a training run to an app and the zoo, by the tools alone; and each tool used wrongly."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+TOOLS = Path(__file__).parents[2] / "tools"
+
+pytestmark = pytest.mark.slow
+
+
+def tool(name, *words):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [name, *map(str, words)])
+        runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, scenes):
+    folder = tmp_path_factory.mktemp("run")
+    content = {
+        "model": {"class_path": "LitStudent", "init_args": {"backbone": "resnet10t", "width": 16}},
+        "data": {"root": str(scenes), "scene": "heads", "image_size": 32, "short_side": 36, "validation": "none"},
+        "trainer": {"max_epochs": 1, "accelerator": "cpu", "default_root_dir": str(folder)},
+        "onnx_export": {"enabled": False},
+    }
+    (folder / "recipe.yaml").write_text(yaml.safe_dump(content))
+    tool("train", folder / "recipe.yaml")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bundle(run):
+    tool("export", run / "checkpoints/last.ckpt", "--to", "onnx,fp16", "--raw-input")
+    return run / "bundle"
+
+
+def test_a_bundle_is_verified_and_localises(bundle, scenes, tmp_path, capsys):
+    tool("verify_bundle", bundle)
+    said = capsys.readouterr().out
+    assert said.count("as PyTorch") == 2
+    tool("localize", bundle, scenes / "heads/seq-03", "--out", tmp_path / "poses.tum")
+    assert "8 poses" in capsys.readouterr().out
+    poses = np.loadtxt(tmp_path / "poses.tum")
+    assert poses.shape == (8, 8)
+    np.testing.assert_allclose(np.linalg.norm(poses[:, 4:], axis=1), 1, atol=1e-5)
+
+
+def test_a_checkpoint_is_published(run, tmp_path, capsys):
+    tool("publish", run / "checkpoints/last.ckpt", "--tag", "heads", "--zoo", tmp_path)
+    assert str(tmp_path / "student.heads") in capsys.readouterr().out
+    assert {p.name for p in (tmp_path / "student.heads").iterdir()} == {
+        "manifest.yaml", "weights.safetensors", "README.md",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    [
+        ("export", ["nothing.ckpt"], "nothing.ckpt: no such checkpoint"),
+        ("export", ["{run}/checkpoints/last.ckpt", "--to", "onnx,tflite"], "tflite is none of onnx, fp16, ort"),
+        ("export", ["{run}/checkpoints/last.ckpt", "--out", "{run}"], "is there already"),
+        ("verify_bundle", ["nothing"], "give a bundle's folder"),
+        ("verify_bundle", ["{run}"], "give a bundle's folder"),
+        ("localize", ["nothing.onnx", "0"], "nothing.onnx: no such model"),
+        ("localize", ["{run}", "0"], "holds none of model.onnx"),
+        ("localize", ["{run}/bundle", "nothing.mp4"], "no such file, folder or camera"),
+        ("publish", ["{run}/recipe.yaml", "--tag", "a"], "recipe.yaml"),
+        ("publish", ["{run}/checkpoints/last.ckpt", "--tag", "A B"], "choose another"),
+        ("publish", ["nothing.ckpt", "--tag", "a"], "no such checkpoint"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(name, words, message, run, bundle, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        tool(name, *(word.format(run=run) for word in words))
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
