@@ -157,7 +157,7 @@ class LitDistillation(LitStudent):
     def on_fit_start(self) -> None:
         """With ``cache_teacher``, ask it for every training frame."""
         if self.hparams["cache_teacher"]:
-            images = self.trainer.datamodule.centred_training_images()  # type: ignore[attr-defined]
+            images = self.scene_for("cache_teacher").centred_training_images()
             shown = track(images, "Asking the teacher", transient=True, disable=self.global_rank > 0)
             answers = [self.teacher(image.to(self.device)) for image in shown]
             self.answers = Answers(*(torch.cat(each) for each in zip(*answers, strict=True)))

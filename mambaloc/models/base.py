@@ -103,12 +103,20 @@ class LitPoseRegressor(L.LightningModule):
     def setup(self, stage: str) -> None:
         """Take the scene's position statistics before the first epoch."""
         if stage == "fit" and self.normalise_position:
-            data = getattr(self.trainer, "datamodule", None)
-            if data is None:
-                raise InputError("model.normalise_position: needs the scene; give the trainer a PoseDataModule")
             for module in self.network.modules():
                 if isinstance(module, PositionScale):
-                    module.fit(data.train_position_m)
+                    module.fit(self.scene_for("normalise_position").train_position_m)
+
+    def scene_for(self, argument: str) -> Any:
+        """Return the trainer's data module, of which an argument asks more than batches.
+
+        Raises:
+            InputError: where the trainer was given loaders alone.
+        """
+        data = getattr(self.trainer, "datamodule", None)
+        if data is None:
+            raise InputError(f"model.{argument}: needs the scene; give the trainer a PoseDataModule")
+        return data
 
     def on_train_epoch_start(self) -> None:
         """Log the learning rate."""

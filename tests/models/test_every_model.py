@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 
 import mambaloc
 from mambaloc.benchmark.latency import random_frames
+from mambaloc.errors import InputError
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.models import LitPoseRegressor
 from mambaloc.models.registry import model_class
@@ -164,6 +165,12 @@ def test_gradients_can_be_clipped_under_mixed_precision(clip, tmp_path):
     )  # fmt: skip
     trainer.fit(system, DataLoader([frames()], batch_size=None))
     assert trainer.optimizers[0].defaults["fused"] is (clip is None)
+
+
+def test_what_needs_the_scene_says_so(tmp_path):
+    trainer = L.Trainer(default_root_dir=tmp_path, accelerator="cpu", max_epochs=1, logger=False)
+    with pytest.raises(InputError, match=r"model\.normalise_position: needs the scene; give the trainer a Pose"):
+        trainer.fit(small("student", "none", normalise_position=True), DataLoader([frames()], batch_size=None))
 
 
 def learned_by_heart(name: str, start: nn.Module | None = None, lr: float = 3e-3, steps: int = 300) -> LitPoseRegressor:
