@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mambaloc.console import exits_cleanly, quieten
-from mambaloc.zoo import publish
+from mambaloc.zoo.publishing import publish
 
 
 @exits_cleanly

@@ -2,6 +2,5 @@
 
 from mambaloc.zoo.loading import list_released, load
 from mambaloc.zoo.manifest import Manifest, Result
-from mambaloc.zoo.publishing import publish
 
-__all__ = ["Manifest", "Result", "list_released", "load", "publish"]
+__all__ = ["Manifest", "Result", "list_released", "load"]

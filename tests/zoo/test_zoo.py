@@ -11,7 +11,8 @@ import mambaloc
 from mambaloc.cli import main
 from mambaloc.errors import InputError
 from mambaloc.models.mambaloc import LitMambaLoc
-from mambaloc.zoo import Manifest, list_released, load, publish
+from mambaloc.zoo import Manifest, list_released, load
+from mambaloc.zoo.publishing import publish
 
 
 @pytest.fixture(scope="module")
