@@ -1,0 +1,34 @@
+"""What comes with the package does what its manifest says."""
+
+from pathlib import Path
+
+import pytest
+
+import mambaloc
+from mambaloc.data import PoseDataModule
+from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.metrics import summarise
+from mambaloc.zoo import Manifest, list_released
+
+ZOO = Path(__file__).parents[2] / "zoo"
+
+
+def test_it_is_small_and_in_the_wheel():
+    shipped = [path for path in ZOO.iterdir() if path.is_dir()]
+    assert [path.name for path in shipped] == ["student.embedded_room"]
+    assert {path.name for path in shipped} <= set(list_released())
+    assert sum(file.stat().st_size for file in shipped[0].iterdir()) < 8e6
+    assert f'"zoo/{shipped[0].name}/*"' in (ZOO.parent / "pyproject.toml").read_text()
+
+
+@pytest.mark.slow
+def test_its_figures_are_found_again(tmp_path):
+    system, manifest = mambaloc.load("student.embedded_room"), Manifest.read(ZOO / "student.embedded_room")
+    (result,) = manifest.results
+    assert result.data == manifest.scene == "embedded/room"
+    data = PoseDataModule("embedded", str(tmp_path), image_size=system.image_size, short_side=manifest.short_side)
+    table = localise_test_frames(system, data, "cpu")
+    assert len(table.index) == result.n
+    found = summarise(table)
+    assert found["position_error_m"] == pytest.approx(result.position_error_m, abs=2e-3)
+    assert found["rotation_error_deg"] == pytest.approx(result.rotation_error_deg, abs=0.05)
