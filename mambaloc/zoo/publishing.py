@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shutil
@@ -18,6 +19,7 @@ from mambaloc.evaluation.evaluate import data_of, localise_test_frames
 from mambaloc.metrics import summarise
 from mambaloc.models import load_checkpoint
 from mambaloc.models.base import read_checkpoint
+from mambaloc.models.registry import model_class
 from mambaloc.runtime.bundle import sha256_of
 from mambaloc.runtime.contract import POSE
 from mambaloc.types import height_and_width
@@ -85,7 +87,8 @@ def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") ->
 
 
 def card(name: str, manifest: Manifest) -> str:
-    """A model card in Markdown."""
+    """A model card in Markdown; what the system is, its own module says."""
+    about = inspect.cleandoc(inspect.getmodule(model_class(manifest.model)).__doc__ or "")
     rows = "\n".join(
         f"| {r.data}{'' if r.official_split else ' (no official split)'}, {r.split}, {r.n} frames | {r.selection} | "
         f"{r.position_error_m:.3f} m | {r.rotation_error_deg:.2f}° | {r.seed} | {r.seconds:.0f} s | {r.device} | "
@@ -104,6 +107,12 @@ def card(name: str, manifest: Manifest) -> str:
 | data | epoch | median position | median rotation | seed | training | device | commit |
 |---|---|---|---|---|---|---|---|
 {rows}
+
+## System
+
+{about}
+
+Here with the backbone {manifest.arguments["backbone"]}, GIS: {manifest.arguments["gis"]}.
 
 ## Trained
 

@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from mambaloc.cli import main
 from mambaloc.errors import InputError
 from mambaloc.models.mambaloc import LitMambaLoc
 from mambaloc.zoo import Manifest, list_released, load
-from mambaloc.zoo.publishing import publish
+from mambaloc.zoo.publishing import card, publish
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +68,11 @@ def test_every_figure_says_where_it_is_from(released):
     card = (released / "README.md").read_text()
     assert f"{result.position_error_m:.3f} m" in card
     assert "no official split" in card
+
+
+def test_a_card_says_what_the_system_is(released):
+    manifest = replace(Manifest.read(released), model="transbonet")
+    assert "No code was published; this is from its description" in card("transbonet.tiny", manifest)
 
 
 def test_a_name_finds_it(released, monkeypatch):
