@@ -22,8 +22,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, help="that one image may use")
     args = parser.parse_args()
     localiser = Localiser(args.model, args.threads)
-    frames, count = frames_of(args.source)
-    found = []
+    (frames, count), found = frames_of(args.source), []
     try:
         for frame in track(frames, "Localising", count, console=Console(stderr=True), transient=True):
             found.append((frame.time_s, localiser.localise(frame.image)))

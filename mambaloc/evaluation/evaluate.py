@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from datetime import UTC, datetime
@@ -16,6 +15,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.references import median_training_pose
 from mambaloc.evaluation.trajectories import write_csv
+from mambaloc.files import sha256
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models import LitPoseRegressor, load_checkpoint
 from mambaloc.models.base import mib, parameter_count, read_checkpoint
@@ -138,15 +138,10 @@ def _describe_training(stored: dict[str, Any], checkpoint: Path) -> dict[str, An
         "step": stored["global_step"],
         "wall_clock": clock,
         "recipe": str(recipe) if recipe.is_file() else None,
-        "recipe_sha256": _sha256(recipe) if recipe.is_file() else None,
+        "recipe_sha256": sha256(recipe) if recipe.is_file() else None,
         "checkpoint": str(checkpoint),
-        "checkpoint_sha256": _sha256(checkpoint),
+        "checkpoint_sha256": sha256(checkpoint),
     }
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, data: PoseDataModule) -> None:

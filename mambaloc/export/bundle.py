@@ -19,9 +19,10 @@ from mambaloc.errors import InputError
 from mambaloc.export.onnx import contract_of, export_onnx
 from mambaloc.export.precision import half_precision, write_ort
 from mambaloc.export.preprocessing import with_preprocessing
+from mambaloc.files import sha256, whole_folder
 from mambaloc.geometry import canonical
 from mambaloc.models import LitPoseRegressor
-from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, sha256, verify_bundle
+from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, verify_bundle
 from mambaloc.runtime.contract import METADATA_KEY, Contract
 from mambaloc.runtime.localiser import read_image
 
@@ -56,10 +57,7 @@ def write_bundle(
     """
     if out.exists():
         raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
-    partial = out.with_name(f".{out.name}.partial")
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+    with whole_folder(out, "choose another folder with --out") as partial:
         contract = _write_models(system, data, partial, formats, target, raw_input)
         frames = _write_frames(system, data, partial, contract)
         size_m = max(1.0, float(system.network.head.position_scale.scale_m))
@@ -69,11 +67,6 @@ def write_bundle(
         if bad := [each for each in deviations if not each.within]:
             worst = f"{bad[0].position_mm:.2g} mm and {bad[0].rotation_deg:.2g} deg"
             raise InputError(f"{out / bad[0].file}: deviates by {worst} from PyTorch, so no bundle was written")
-        partial.replace(out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another folder with --out") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return deviations
 
 
@@ -84,14 +77,13 @@ def _write_models(
     contract = replace(plain, preprocessing=replace(plain.preprocessing, in_model=raw_input))
     network = folder / _FILES["onnx"]
     export_onnx(system, network, plain)
-    for name in ("fp16", "onnx"):  # the plain one last: the other is made from it
+    for name in ("fp16", "onnx") if "fp16" in formats else ("onnx",):  # the plain one last: the other is made from it
         model = onnx.load(network)
         model = half_precision(model) if name == "fp16" else model
         if raw_input:
             model = with_preprocessing(model, contract.preprocessing)
-        if name == "onnx" or name in formats:
-            _tell(model, contract)
-            onnx.save(model, folder / _FILES[name])
+        _tell(model, contract)
+        onnx.save(model, folder / _FILES[name])
     if "ort" in formats:
         write_ort(network, folder / _FILES["ort"], target)
     if "onnx" not in formats:

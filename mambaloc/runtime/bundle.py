@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.files import sha256
 from mambaloc.runtime.localiser import Localiser
 
 CONTRACT_FILE = "contract.json"
@@ -55,17 +55,6 @@ def verify_bundle(folder: Path, threads: int | None = None) -> list[Deviation]:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: is no bundle's contract ({reason}); write the bundle anew") from None
-
-
-def sha256(path: Path) -> str:
-    """Digest of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def sha256_of(content: bytes) -> str:
-    """Digest of a file's content."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def rotation_deg(a: NDArray[np.floating[Any]], b: NDArray[np.floating[Any]]) -> float:

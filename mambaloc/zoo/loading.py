@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from difflib import get_close_matches
 from pathlib import Path
@@ -13,7 +14,6 @@ from safetensors.torch import load as tensors_of
 from mambaloc import models
 from mambaloc.errors import InputError
 from mambaloc.models import LitPoseRegressor, create_model
-from mambaloc.runtime.bundle import sha256_of
 from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest
 
 _ZOOS = (Path(__file__).parents[2] / "zoo", Path(sys.prefix) / "share/mambaloc/zoo")
@@ -61,7 +61,7 @@ def load_released(folder: Path) -> LitPoseRegressor:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); get the model anew") from None
-    if sha256_of(content) != manifest.weights_sha256:
+    if hashlib.sha256(content).hexdigest() != manifest.weights_sha256:
         raise InputError(f"{path}: is not the file that its manifest speaks of (sha256 differs); get the model anew")
     try:
         system = create_model(manifest.model, **{**manifest.arguments, "backbone_weights": None, "warm_start": None})

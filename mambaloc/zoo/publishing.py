@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import json
 import re
-import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from safetensors.torch import save
 
+from mambaloc.data import PoseDataModule
 from mambaloc.data.download.origins import SOURCES
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint
 from mambaloc.evaluation.evaluate import data_of, localise_test_frames
+from mambaloc.files import whole_folder
 from mambaloc.metrics import summarise
 from mambaloc.models import load_checkpoint
 from mambaloc.models.base import read_checkpoint
 from mambaloc.models.registry import model_class
-from mambaloc.runtime.bundle import sha256_of
 from mambaloc.runtime.contract import POSE
 from mambaloc.types import height_and_width
 from mambaloc.zoo.loading import load_released
@@ -53,12 +54,9 @@ def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") ->
     if folder.exists():
         raise InputError(f"{folder}: is released already; choose another tag")
     system, data = load_checkpoint(checkpoint), data_of(stored, checkpoint)
-    partial = folder.with_name(f".{folder.name}.partial")
-    try:
-        with TemporaryDirectory() as scratch:
-            measured = evaluate_checkpoint(checkpoint, Path(scratch), data, accelerator)
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+    with TemporaryDirectory() as scratch:
+        measured = evaluate_checkpoint(checkpoint, Path(scratch), data, accelerator)
+    with whole_folder(folder, "choose another --zoo") as partial:
         weights = save({name: tensor.contiguous().cpu() for name, tensor in system.network.state_dict().items()})
         manifest = Manifest(
             model=system.registry_name,
@@ -68,7 +66,7 @@ def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") ->
             scene=f"{data.hparams['dataset']}/{measured['data']['scene']}",
             short_side=data.hparams["short_side"],
             pose=POSE,
-            weights_sha256=sha256_of(weights),
+            weights_sha256=hashlib.sha256(weights).hexdigest(),
             weights_bytes=len(weights),
             trained=_plain({**stored["mambaloc"], "recipe_sha256": measured["training"]["recipe_sha256"]}),
             results=(_result(measured),),
@@ -77,12 +75,7 @@ def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") ->
         (partial / WEIGHTS_FILE).write_bytes(weights)
         (partial / MANIFEST_FILE).write_text(manifest.to_yaml(), encoding="utf-8")
         (partial / CARD_FILE).write_text(card(folder.name, manifest), encoding="utf-8")
-        _agree(partial, measured, data_of(stored, checkpoint), accelerator)
-        partial.replace(folder)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --zoo") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        _agree(partial, measured, data, accelerator)
     return folder
 
 
@@ -144,7 +137,7 @@ def _result(measured: dict[str, Any]) -> Result:
     )
 
 
-def _agree(folder: Path, measured: dict[str, Any], data: Any, accelerator: str) -> None:
+def _agree(folder: Path, measured: dict[str, Any], data: PoseDataModule, accelerator: str) -> None:
     """Refuse what does not find again what was measured."""
     again = summarise(localise_test_frames(load_released(folder), data, accelerator))
     before = measured["metrics"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import shutil
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from mambaloc.data.download.archives import require_space, unpack
 from mambaloc.data.download.fetch import UnreachableError, fetch
 from mambaloc.data.download.origins import Archive, Source, find_scene, find_source
 from mambaloc.errors import InputError
+from mambaloc.files import sha256
 
 _UNPACKED_PER_BYTE = 1.2  # images hardly compress; the margin holds one inner zip
 _MOST_UNPACKED_PER_BYTE = 10
@@ -122,12 +122,11 @@ def _identify(source: Source, scene: str, archive: Path, url: str | None, accept
     known, size_bytes = source.archives[scene], archive.stat().st_size
     _check_size(size_bytes, known, str(archive), accept_changed)
     print(f"checking {archive}")
-    with archive.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    digest = sha256(archive)
     for expected, whose in ((known.sha256, "known"), (_recorded_sha256(archive), f"in {_record_of(archive).name}")):
-        if expected not in (None, sha256) and not accept_changed:
+        if expected not in (None, digest) and not accept_changed:
             raise InputError(
-                f"{archive} has sha256 {sha256}, the one {whose} is {expected}: delete it and run this again, "
+                f"{archive} has sha256 {digest}, the one {whose} is {expected}: delete it and run this again, "
                 "or take it as it is with --accept-changed"
             )
     return {
@@ -135,7 +134,7 @@ def _identify(source: Source, scene: str, archive: Path, url: str | None, accept
         "scene": scene,
         "url": url,  # None: the archive was there already
         "size_bytes": size_bytes,
-        "sha256": sha256,
+        "sha256": digest,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "licence": source.licence,
     }
