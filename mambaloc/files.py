@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock
 
 from mambaloc.errors import InputError
 
@@ -38,3 +40,27 @@ def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
         raise InputError(f"{folder}: cannot be written ({error.strerror}); {remedy}") from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def made_once(folder: Path, make: Callable[[Path], object]) -> Path:
+    """A folder of the user's cache: made by who comes first, while others wait, and found again by all.
+
+    Args:
+        folder: its name.
+        make: fills an empty folder, which gets its name once this ends; an error leaves nothing.
+
+    Raises:
+        InputError: where it cannot be written.
+    """
+    remedy = "set MAMBALOC_CACHE to a folder that can"
+    if folder.is_dir():
+        return folder
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.with_name(f"{folder.name}.lock")):
+            if not folder.is_dir():  # another process may have made it meanwhile
+                with whole_folder(folder, remedy) as partial:
+                    make(partial)
+    except OSError as error:
+        raise InputError(f"{folder.parent}: cannot be written ({error.strerror}); {remedy}") from None
+    return folder

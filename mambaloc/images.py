@@ -5,9 +5,13 @@ Training and the torch-free runtime both use these, so that an image looks the s
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
 
 Image = NDArray[np.uint8]
 """RGB, (H, W, 3)."""
@@ -34,6 +38,36 @@ def decode_image(data: bytes) -> Image | str:
     if image is None:
         return "image cannot be decoded"
     return image[..., ::-1]  # type: ignore[return-value]
+
+
+def read_image(path: str | Path) -> Image:
+    """Read an image file as RGB, upright.
+
+    Raises:
+        InputError: where it is missing or no whole image.
+    """
+    try:
+        image = decode_image(Path(path).read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a picture") from None
+    if isinstance(image, str):
+        raise InputError(f"{path}: {image}; give a whole JPEG or PNG")
+    return image
+
+
+def as_rgb(image: Image) -> Image:
+    """Check an array and make grey or RGBA RGB; (H, W), (H, W, 3) or (H, W, 4) -> (H, W, 3).
+
+    Raises:
+        InputError: for anything else.
+    """
+    image = np.asarray(image)
+    channels = {2: 1, 3: image.shape[-1]}.get(image.ndim)
+    if image.dtype != np.uint8 or channels not in (1, 3, 4) or 0 in image.shape:
+        raise InputError(f"image array {image.dtype} {image.shape}: give uint8 RGB (H, W, 3) or grey (H, W)")
+    if image.ndim == 2:
+        image = image[..., None]
+    return np.repeat(image, 3, axis=-1) if channels == 1 else image[..., :3]
 
 
 def resized_size(size: tuple[int, int], short_side: int) -> tuple[int, int]:

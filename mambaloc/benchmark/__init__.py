@@ -1,17 +1,21 @@
 """Measurements of the library itself: each a ratio taken in one run."""
 
+from mambaloc.benchmark.deployment import Deployment, measure_deployment
 from mambaloc.benchmark.latency import Latency, forward_flops, measure_latency
 from mambaloc.benchmark.loading import LoadingRates, measure_loading
-from mambaloc.benchmark.report import print_latencies, print_loading, print_sizes
+from mambaloc.benchmark.report import print_deployments, print_latencies, print_loading, print_sizes
 from mambaloc.benchmark.sizes import Size, size_of, size_table
 
 __all__ = [
+    "Deployment",
     "Latency",
     "LoadingRates",
     "Size",
     "forward_flops",
+    "measure_deployment",
     "measure_latency",
     "measure_loading",
+    "print_deployments",
     "print_latencies",
     "print_loading",
     "print_sizes",

@@ -75,7 +75,7 @@ def measure_latency(
         frames = random_frames(batch, image_size, device)
         for what, call in (("forward", forward), ("training step", training_step)):
             calls = [call(system, frames) for system in pair]
-            found.append(Latency(name, what, batch, *_in_turns(calls, repetitions, device)))
+            found.append(Latency(name, what, batch, *in_turns(calls, repetitions, device)))
     return found
 
 
@@ -130,7 +130,8 @@ def random_frames(count: int, side: int, device: str = "cpu", seed: int = 0) -> 
     )
 
 
-def _in_turns(calls: list[Callable[[], object]], repetitions: int, device: str) -> list[list[float]]:
+def in_turns(calls: list[Callable[[], object]], repetitions: int, device: str = "cpu") -> list[list[float]]:
+    """Seconds of each call, one after the other so many times, after a warm-up: all meet the same machine."""
     for _ in range(WARM_UP):
         for call in calls:
             call()

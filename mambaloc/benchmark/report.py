@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from statistics import median
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from mambaloc.benchmark.deployment import Deployment, speed_up
 from mambaloc.benchmark.latency import Latency, forward_flops
 from mambaloc.benchmark.loading import LoadingRates
 from mambaloc.benchmark.sizes import UNEXPLAINED, Size
@@ -61,6 +63,24 @@ def print_latencies(latencies: Sequence[Latency], image_size: int, machine: str)
     console.print("Products and convolutions; LSTMs and element-wise operations are not counted.")
 
 
+def print_deployments(deployments: Sequence[Deployment], threads: int, machine: str) -> None:
+    """Print a row a system and form: size, latency with its spread, how much faster than the first row, errors."""
+    title = f"One image at a time, {threads} threads, {machine}; errors: medians over the test frames"
+    table = _table(title, "system", "form", "MiB", "ms", "± IQR", "faster", "median m", "median °", "note")
+    for each in deployments:
+        times = (f"{1000 * s:.2f}" for s in (median(each.latency_s), each.spread_s))
+        errors = (f"{each.position_error_m:.3f}", f"{each.rotation_error_deg:.2f}")
+        ratio = f"{speed_up(deployments, each):.1f}x"
+        table.add_row(_run(each.name), each.form, f"{each.size / 2**20:.2f}", *times, ratio, *errors, each.note)
+    Console(highlight=False).print(table)
+
+
+def _run(source: str) -> str:
+    """A training run's folder for its checkpoint's path; another name as it is."""
+    path = Path(source)
+    return path.parent.parent.name if path.suffix == ".ckpt" else source
+
+
 def print_loading(rates: LoadingRates, machine: str) -> None:
     """Print images per second, and their ratio."""
     for name, figures in (("decode-once cache", rates.cached), ("decode every epoch", rates.decoded)):
@@ -71,6 +91,6 @@ def print_loading(rates: LoadingRates, machine: str) -> None:
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for column in columns:
-        text = column in ("system", "gis", "what")
+        text = column in ("system", "gis", "what", "form", "note")
         table.add_column(column, justify="left" if text else "right", no_wrap=True)
     return table

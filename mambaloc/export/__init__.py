@@ -2,6 +2,6 @@
 
 from mambaloc.export.bundle import FORMATS, write_bundle
 from mambaloc.export.onnx import Parity, contract_of, export_onnx
-from mambaloc.export.precision import TARGETS
+from mambaloc.export.pages import TARGETS
 
 __all__ = ["FORMATS", "TARGETS", "Parity", "contract_of", "export_onnx", "write_bundle"]

@@ -3,35 +3,50 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import onnx
 import torch
+from rich.console import Console
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.download.origins import SOURCES
 from mambaloc.errors import InputError
 from mambaloc.export.onnx import contract_of, export_onnx
+from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
 from mambaloc.export.preprocessing import with_preprocessing
+from mambaloc.export.quantisation import EightBit, eight_bit
 from mambaloc.files import sha256, whole_folder
 from mambaloc.geometry import canonical
+from mambaloc.images import read_image
 from mambaloc.models import LitPoseRegressor
-from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, verify_bundle
+from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, replay, verify_bundle
 from mambaloc.runtime.contract import METADATA_KEY, Contract
-from mambaloc.runtime.localiser import read_image
 
-FORMATS = ("onnx", "fp16", "ort")
+FORMATS = ("onnx", "fp16", "int8", "ort")
+TRAJECTORY_FILE = "trajectory.json"
 _FRAMES = 5
+_FILES = {"onnx": "model.onnx", "fp16": "model.fp16.onnx", "int8": "model.int8.onnx", "ort": "model.ort"}
 _ALLOWED = {"onnx": (1.0, 0.1), "ort": (1.0, 0.1), "fp16": (20.0, 1.0)}
-"""Largest deviation in millimetres and degrees, per metre of the scene's size."""
+"""Largest deviation in millimetres and degrees, per metre of the scene's size; int8 has a gate of its own."""
 
-_FILES = {"onnx": "model.onnx", "fp16": "model.fp16.onnx", "ort": "model.ort"}
+
+@dataclass(frozen=True)
+class WrittenBundle:
+    """What was written.
+
+    Args:
+        deviations: of each model in the bundle from PyTorch.
+        int8: how quantisation went, where it was asked for; left out unless it ``fits``.
+    """
+
+    deviations: list[Deviation]
+    int8: EightBit | None
 
 
 def write_bundle(
@@ -41,54 +56,67 @@ def write_bundle(
     formats: Sequence[str] = ("onnx", "fp16"),
     target: str = "android",
     raw_input: bool = False,
-) -> list[Deviation]:
+) -> WrittenBundle:
     """Write a bundle's folder; it appears once every model in it has found the poses that the system finds.
+
+    Int8 is left out where it loses too much; see :func:`~mambaloc.export.quantisation.eight_bit`.
 
     Args:
         system: trained.
         data: what it was trained with; a few of its test frames go into the bundle.
         out: the folder, which must not be there yet.
         formats: of ``FORMATS``.
-        target: machine that the ORT format is optimised for.
+        target: of ``TARGETS``, which its page on integration is about.
         raw_input: resize, crop and scale inside of the models, which then take RGB of any size.
 
     Raises:
-        InputError: where the folder is there or cannot be written, the test frames are not there, or a model deviates.
+        InputError: where the folder is there or cannot be written, the test frames are not there, a model deviates, or
+            nothing is left to write.
     """
     if out.exists():
         raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
-    with whole_folder(out, "choose another folder with --out") as partial:
-        contract = _write_models(system, data, partial, formats, target, raw_input)
+    data.setup("test")
+    status = Console(stderr=True).status(f"exporting {system.registry_name}")
+    with status, whole_folder(out, "choose another folder with --out") as partial:
+        contract, int8 = _write_models(system, data, partial, formats, raw_input)
+        written = [name for name in formats if (partial / _FILES[name]).is_file()]
+        if not written:
+            raise InputError(f"{out}: nothing to write: {int8}")
         frames = _write_frames(system, data, partial, contract)
+        _write_trajectory(data, partial)
         size_m = max(1.0, float(system.network.head.position_scale.scale_m))
-        _write_contract(partial, contract, frames, formats, size_m)
-        (partial / "README.md").write_text(_card(contract, data, formats), encoding="utf-8")
+        write_pages(partial, contract, data.hparams["dataset"], [_FILES[name] for name in written], target)
+        _write_contract(partial, contract, frames, written, size_m, int8)
         deviations = verify_bundle(partial)
         if bad := [each for each in deviations if not each.within]:
             worst = f"{bad[0].position_mm:.2g} mm and {bad[0].rotation_deg:.2g} deg"
             raise InputError(f"{out / bad[0].file}: deviates by {worst} from PyTorch, so no bundle was written")
-    return deviations
+    return WrittenBundle(deviations, int8)
 
 
 def _write_models(
-    system: LitPoseRegressor, data: PoseDataModule, folder: Path, formats: Sequence[str], target: str, raw_input: bool
-) -> Contract:
+    system: LitPoseRegressor, data: PoseDataModule, folder: Path, formats: Sequence[str], raw_input: bool
+) -> tuple[Contract, EightBit | None]:
     plain = contract_of(system, data.hparams)
     contract = replace(plain, preprocessing=replace(plain.preprocessing, in_model=raw_input))
     network = folder / _FILES["onnx"]
     export_onnx(system, network, plain)
-    for name in ("fp16", "onnx") if "fp16" in formats else ("onnx",):  # the plain one last: the other is made from it
-        model = onnx.load(network)
-        model = half_precision(model) if name == "fp16" else model
-        if raw_input:
-            model = with_preprocessing(model, contract.preprocessing)
-        _tell(model, contract)
-        onnx.save(model, folder / _FILES[name])
+    model = onnx.load(network)
+    int8 = eight_bit(model, data) if "int8" in formats else None
+    models = {"onnx": model}
+    if "fp16" in formats:
+        models["fp16"] = half_precision(model)
+    if int8 and int8.fits:
+        models["int8"] = int8.model
+    for name, each in models.items():
+        whole = with_preprocessing(each, contract.preprocessing) if raw_input else each
+        _tell(whole, contract)
+        onnx.save(whole, folder / _FILES[name])
     if "ort" in formats:
-        write_ort(network, folder / _FILES["ort"], target)
+        write_ort(network, folder / _FILES["ort"])
     if "onnx" not in formats:
         network.unlink()
-    return contract
+    return contract, int8
 
 
 def _tell(model: onnx.ModelProto, contract: Contract) -> None:
@@ -99,22 +127,24 @@ def _tell(model: onnx.ModelProto, contract: Contract) -> None:
 def _write_frames(
     system: LitPoseRegressor, data: PoseDataModule, folder: Path, contract: Contract
 ) -> list[dict[str, Any]]:
-    """Copy test frames, evenly spread, with the poses that the system itself finds."""
-    data.setup("test")
+    """Write test frames, evenly spread, with the poses that the system itself finds.
+
+    As PNG: no two decoders agree on a JPEG.
+    """
     paths = data.frames("test").image_paths
     chosen = [paths[row] for row in np.linspace(0, len(paths) - 1, min(_FRAMES, len(paths))).round().astype(int)]
     (folder / "frames").mkdir()
     told = []
     for number, path in enumerate(chosen):
-        copy = Path("frames", f"{number}{path.suffix.lower()}")
-        shutil.copyfile(path, folder / copy)
-        cropped = contract.preprocessing.apply(read_image(path))
+        rgb, copy = read_image(path), f"frames/{number}.png"
+        cv2.imwrite(str(folder / copy), rgb[..., ::-1])
+        cropped = contract.preprocessing.apply(rgb)
         image = torch.from_numpy(np.ascontiguousarray(cropped.transpose(2, 0, 1)))[None].float() / 255
         with torch.inference_mode():
             prediction = system.cpu().eval()(image)
         told.append(
             {
-                "file": copy.as_posix(),
+                "file": copy,
                 "position_m": prediction.position_m[0].tolist(),
                 "quaternion_wxyz": canonical(prediction.quaternion)[0].tolist(),
             }
@@ -122,47 +152,49 @@ def _write_frames(
     return told
 
 
+def _write_trajectory(data: PoseDataModule, folder: Path) -> None:
+    """Write where the training frames were taken, x y z qw qx qy qz a frame, for an app to draw."""
+    try:
+        frames = data.listed_training_frames()
+    except InputError:  # a test split alone can be exported too
+        return
+    poses = np.concatenate([frames.position_m, frames.quaternion], axis=1).round(5)
+    sequences = {name: poses[rows].tolist() for name, rows in frames.by_sequence().items()}
+    (folder / TRAJECTORY_FILE).write_text(json.dumps({"sequences": sequences}) + "\n", encoding="utf-8")
+
+
 def _write_contract(
-    folder: Path, contract: Contract, frames: list[dict[str, Any]], formats: Sequence[str], size_m: float
+    folder: Path,
+    contract: Contract,
+    frames: list[dict[str, Any]],
+    formats: Sequence[str],
+    size_m: float,
+    int8: EightBit | None,
 ) -> None:
-    files: dict[str, dict[str, Any]] = {}
+    """Write ``contract.json``, last of all files, since it digests them."""
+    others = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    files: dict[str, dict[str, Any]] = {_FILES[name]: {} for name in formats}
+    files |= {name: {} for path in others if (name := path.relative_to(folder).as_posix()) not in files}
+    for name, entry in files.items():
+        entry |= {"sha256": sha256(folder / name), "bytes": (folder / name).stat().st_size}
     for name in formats:
-        path = folder / _FILES[name]
-        mm, deg = _ALLOWED[name]
-        allowed = {"position_mm": mm * size_m, "rotation_deg": deg}
-        files[path.name] = {"sha256": sha256(path), "bytes": path.stat().st_size, "allowed": allowed}
-    for frame in frames:
-        files[frame["file"]] = {"sha256": sha256(folder / frame["file"])}
+        if name == "int8":
+            assert int8 is not None
+            mm, deg, _ = replay(folder / _FILES[name], frames)
+            allowed_mm, allowed_deg = 1.5 * mm + 5, 1.5 * deg + 0.25  # what its kernels do on another processor
+            files[_FILES[name]]["quantised"] = _in_figures(int8)
+        else:
+            allowed_mm, allowed_deg = _ALLOWED[name][0] * size_m, _ALLOWED[name][1]
+        files[_FILES[name]]["allowed"] = {"position_mm": allowed_mm, "rotation_deg": allowed_deg}
     bundle = {**json.loads(contract.to_json()), "files": files, "frames": frames}
     (folder / CONTRACT_FILE).write_text(json.dumps(bundle, indent=2) + "\n", encoding="utf-8")
 
 
-def _card(contract: Contract, data: PoseDataModule, formats: Sequence[str]) -> str:
-    source = SOURCES.get(data.hparams["dataset"])
-    terms = f"{source.title}: {source.licence}. {source.terms}" if source else "see who made them."
-    models = "\n".join(f"- `{_FILES[name]}`" for name in formats)
-    trained = "\n".join(
-        f"- {name}: {_in_words(value)}" for name, value in contract.trained.items() if value is not None
-    )
-    return f"""# {contract.model} on {contract.scene}
-
-Camera pose of one RGB image, {contract.pose}.
-
-{models}
-- `{CONTRACT_FILE}`: what the models are fed and say, digests, and the poses of `frames/` that a port must find
-
-Check it with `python tools/verify_bundle.py FOLDER`.
-
-## Trained
-
-{trained}
-
-## Licence
-
-The code and the architecture: Apache-2.0. The weights follow the terms of the frames they were trained on, of which
-`frames/` holds some. {terms}
-"""
-
-
-def _in_words(value: Any) -> str:
-    return ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+def _in_figures(int8: EightBit) -> dict[str, Any]:
+    return {
+        "layers": int8.kind,
+        "position_error_m": int8.position_error_m,
+        "rotation_error_deg": int8.rotation_error_deg,
+        "loss": int8.loss,
+        "measured_on": f"{int8.frames} test frames, on which the kind was decided",
+    }

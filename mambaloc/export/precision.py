@@ -14,18 +14,17 @@ from onnxruntime.tools.convert_onnx_models_to_ort import OptimizationStyle, conv
 from onnxruntime.transformers.float16 import convert_float_to_float16
 from onnxruntime.transformers.onnx_model import OnnxModel
 
-_PLATFORMS = {"android": "arm", "ios": "arm", "web": "arm", "pc": "amd64"}
-TARGETS = tuple(_PLATFORMS)
-
 
 def half_precision(model: onnx.ModelProto) -> onnx.ModelProto:
     """Store and compute in float16, but the inputs, the outputs and all from the last products on.
 
     Positions are there in metres already, and a float16 near 300 m is a quarter of a metre off.
     """
+    half = onnx.ModelProto()
+    half.CopyFrom(model)  # the converter works in place
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of weights under 6e-8, which become 6e-8
-        half = convert_float_to_float16(model, keep_io_types=True, node_block_list=_after_last_products(model.graph))
+        half = convert_float_to_float16(half, keep_io_types=True, node_block_list=_after_last_products(model.graph))
     _join_casts(half.graph)
     tidy = OnnxModel(half)
     tidy.prune_graph()
@@ -58,13 +57,14 @@ def _after_last_products(graph: onnx.GraphProto) -> list[str]:
     return list(found)
 
 
-def write_ort(source: Path, out: Path, target: str = "android") -> Path:
-    """Write a model in ORT format, optimised for a kind of machine, and the operators that a reduced build needs.
+def write_ort(source: Path, out: Path) -> Path:
+    """Write a model in ORT format, and the operators that a reduced build needs.
+
+    It is optimised for no processor in particular: a layout of one could not be read on another.
 
     Args:
         source: an ONNX file.
         out: the ``.ort`` file; beside it ``required_operators_and_types.config`` is written.
-        target: one of ``TARGETS``.
 
     Returns:
         The file of operators.
@@ -75,7 +75,7 @@ def write_ort(source: Path, out: Path, target: str = "android") -> Path:
                 source,
                 Path(folder),
                 optimization_styles=[OptimizationStyle.Fixed],
-                target_platform=_PLATFORMS[target],
+                target_platform="arm",  # which leaves out the layout of one x86 processor
                 enable_type_reduction=True,
             )
         (converted,) = Path(folder).glob("*.ort")

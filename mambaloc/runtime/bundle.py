@@ -76,19 +76,19 @@ def _replayed(
     folder: Path, files: dict[str, Any], frames: list[dict[str, Any]], threads: int | None
 ) -> Iterator[Deviation]:
     for name, entry in files.items():
-        if "allowed" not in entry:  # a frame
+        if "allowed" not in entry:  # no model
             continue
-        localiser = Localiser(folder / name, threads)
-        found = [localiser.localise(folder / frame["file"]) for frame in frames]
-        position_mm = max(
-            1000 * float(np.linalg.norm(pose.position_m - np.array(frame["position_m"])))
-            for pose, frame in zip(found, frames, strict=True)
-        )
-        angle_deg = max(
-            rotation_deg(pose.quaternion, np.array(frame["quaternion_wxyz"]))
-            for pose, frame in zip(found, frames, strict=True)
-        )
+        position_mm, angle_deg, latency_ms = replay(folder / name, frames, threads)
         allowed = entry["allowed"]
         within = position_mm <= allowed["position_mm"] and angle_deg <= allowed["rotation_deg"]
-        latency_ms = 1000 * float(np.median([pose.latency_s for pose in found]))
         yield Deviation(name, position_mm, angle_deg, latency_ms, within)
+
+
+def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None) -> tuple[float, float, float]:
+    """Let a model localise its bundle's frames: largest deviation in mm and degrees, and median latency in ms."""
+    localiser = Localiser(model, threads)
+    found = [localiser.localise(model.parent / frame["file"]) for frame in frames]
+    pairs = list(zip(found, frames, strict=True))
+    position_mm = max(1000 * float(np.linalg.norm(p.position_m - np.array(frame["position_m"]))) for p, frame in pairs)
+    angle_deg = max(rotation_deg(p.quaternion, np.array(frame["quaternion_wxyz"])) for p, frame in pairs)
+    return position_mm, angle_deg, 1000 * float(np.median([pose.latency_s for pose in found]))

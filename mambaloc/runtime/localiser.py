@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
 
 from mambaloc.errors import InputError
-from mambaloc.images import Image, decode_image, resized_size
+from mambaloc.images import Image, as_rgb, read_image, resized_size
 from mambaloc.runtime.contract import METADATA_KEY, Contract
+from mambaloc.runtime.sources import frames_of
 
-_IN_A_BUNDLE = ("model.onnx", "model.fp16.onnx", "model.ort")
+_IN_A_BUNDLE = ("model.onnx", "model.fp16.onnx", "model.ort", "model.int8.onnx")
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,26 @@ class Localisation:
     position_m: NDArray[np.float32]
     quaternion: NDArray[np.float32]
     latency_s: float
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where a source's frames were taken, one after another: ``world_from_cam``.
+
+    Shape:
+        ``time_s`` (N,) since the first frame; ``position_m`` (N, 3); ``quaternion`` (N, 4) unit, wxyz, ``w >= 0``.
+
+    Args:
+        time_s: as the video says; of pictures, their place in the list.
+        position_m: in the scene's frame, metres.
+        quaternion: likewise.
+        median_latency_s: of the frames.
+    """
+
+    time_s: NDArray[np.float64]
+    position_m: NDArray[np.float32]
+    quaternion: NDArray[np.float32]
+    median_latency_s: float
 
 
 class Localiser:
@@ -75,6 +99,32 @@ class Localiser:
         position_m, quaternion = self._session.run(None, {self._session.get_inputs()[0].name: self._fed(rgb)})
         return Localisation(position_m[0], quaternion[0], time.perf_counter() - start)
 
+    def localise_each(self, source: str | Path) -> Trajectory:
+        """Localise every frame of a source, with a progress bar on stderr; Ctrl-C ends it and keeps what was found.
+
+        Args:
+            source: a video, a folder of pictures, a picture, or a camera's number.
+
+        Raises:
+            InputError: where there is no such source, it holds no frame, or one cannot be localised.
+        """
+        frames, count = frames_of(source)
+        times: list[float] = []
+        poses: list[Localisation] = []
+        with suppress(KeyboardInterrupt):
+            for frame in track(frames, "Localising", count, console=Console(stderr=True), transient=True):
+                poses.append(self.localise(frame.image))
+                times.append(frame.time_s)
+        if not times:
+            raise InputError(f"{source}: holds no frame; give another video")
+        poses = poses[: len(times)]
+        return Trajectory(
+            np.array(times),
+            np.stack([pose.position_m for pose in poses]),
+            np.stack([pose.quaternion for pose in poses]),
+            float(np.median([pose.latency_s for pose in poses])),
+        )
+
     def _fed(self, rgb: Image) -> NDArray[np.generic]:
         preprocessing = self.contract.preprocessing
         size = resized_size(rgb.shape[:2], preprocessing.short_side)
@@ -87,36 +137,6 @@ class Localiser:
         if preprocessing.in_model:
             return np.ascontiguousarray(rgb)
         return (preprocessing.apply(rgb).transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32)
-
-
-def read_image(path: str | Path) -> Image:
-    """Read an image file as RGB, upright.
-
-    Raises:
-        InputError: where it is missing or no whole image.
-    """
-    try:
-        image = decode_image(Path(path).read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a picture") from None
-    if isinstance(image, str):
-        raise InputError(f"{path}: {image}; give a whole JPEG or PNG")
-    return image
-
-
-def as_rgb(image: Image) -> Image:
-    """Check an array and make grey or RGBA RGB; (H, W), (H, W, 3) or (H, W, 4) -> (H, W, 3).
-
-    Raises:
-        InputError: for anything else.
-    """
-    image = np.asarray(image)
-    channels = {2: 1, 3: image.shape[-1]}.get(image.ndim)
-    if image.dtype != np.uint8 or channels not in (1, 3, 4) or 0 in image.shape:
-        raise InputError(f"image array {image.dtype} {image.shape}: give uint8 RGB (H, W, 3) or grey (H, W)")
-    if image.ndim == 2:
-        image = image[..., None]
-    return np.repeat(image, 3, axis=-1) if channels == 1 else image[..., :3]
 
 
 def _model_file(path: Path) -> Path:

@@ -18,5 +18,5 @@ def print_deviations(deviations: Sequence[Deviation]) -> None:
         table.add_column(column, justify="left" if column in ("model", "") else "right")
     for each in deviations:
         numbers = (f"{each.position_mm:.3g}", f"{each.rotation_deg:.2g}", f"{each.latency_ms:.1f}")
-        table.add_row(each.file, *numbers, "as PyTorch" if each.within else "DEVIATES")
+        table.add_row(each.file, *numbers, "within bounds" if each.within else "DEVIATES")
     Console(highlight=False).print(table)

@@ -9,8 +9,7 @@ from pathlib import Path
 import cv2
 
 from mambaloc.errors import InputError
-from mambaloc.images import Image
-from mambaloc.runtime.localiser import read_image
+from mambaloc.images import Image, read_image
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 

@@ -37,16 +37,26 @@ def load(source: str | Path) -> LitPoseRegressor:
     Raises:
         InputError: where there is no such model, its manifest or digest is wrong, or it is of another architecture.
     """
-    kind, colon, rest = str(source).partition(":")
-    if colon and kind == "local-dir":
-        return load_released(Path(rest))
-    if colon and kind == "hf-hub":
-        return load_released(_from_hub(rest))
     if Path(source).suffix == ".ckpt" or Path(source).is_file():
         return models.load_checkpoint(source)
-    if found := next((zoo / str(source) for zoo in _ZOOS if (zoo / str(source) / MANIFEST_FILE).is_file()), None):
-        return load_released(found)
-    near = get_close_matches(str(source), list_released(), n=3)
+    return load_released(released_folder(str(source)))
+
+
+def released_folder(source: str) -> Path:
+    """The folder of a released model: ``ARCH.TAG``, ``local-dir:FOLDER``, or ``hf-hub:ORG/NAME@REVISION``.
+
+    Raises:
+        InputError: where there is none of this name.
+    """
+    kind, colon, rest = source.partition(":")
+    if colon and kind == "local-dir":
+        return Path(rest)
+    if colon and kind == "hf-hub":
+        return _from_hub(rest)
+    for zoo in _ZOOS:
+        if (zoo / source / MANIFEST_FILE).is_file():
+            return zoo / source
+    near = get_close_matches(source, list_released(), n=3)
     raise InputError(f"{source}: no such model; " + (f"did you mean {', '.join(near)}?" if near else _SOURCES))
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from safetensors.torch import save
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.download.origins import SOURCES
+from mambaloc.data.download.origins import licence_of_weights
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint
 from mambaloc.evaluation.evaluate import data_of, localise_test_frames
@@ -29,7 +29,6 @@ from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest, Result
 
 CARD_FILE = "README.md"
 _STARTS = ("backbone_weights", "warm_start")  # the released weights are whole
-_OWN_LICENCE = "Apache-2.0"  # of weights trained on frames that the project renders itself
 
 
 def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
@@ -70,7 +69,7 @@ def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") ->
             weights_bytes=len(weights),
             trained=_plain({**stored["mambaloc"], "recipe_sha256": measured["training"]["recipe_sha256"]}),
             results=(_result(measured),),
-            licence=_licence(data.hparams["dataset"]),
+            licence=licence_of_weights(data.hparams["dataset"]),
         )
         (partial / WEIGHTS_FILE).write_bytes(weights)
         (partial / MANIFEST_FILE).write_text(manifest.to_yaml(), encoding="utf-8")
@@ -144,11 +143,6 @@ def _agree(folder: Path, measured: dict[str, Any], data: PoseDataModule, acceler
     for name in ("position_error_m", "rotation_error_deg"):
         if not abs(again[name] - before[name]) <= 1e-3 * max(1.0, before[name]):
             raise InputError(f"{folder}: {name} is {again[name]}, where the checkpoint's was {before[name]}; report it")
-
-
-def _licence(dataset: str) -> str:
-    source = SOURCES.get(dataset)
-    return f"{source.title}'s: {source.licence}; {source.terms}" if source else _OWN_LICENCE
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:

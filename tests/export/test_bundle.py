@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from importlib import resources
 
 import cv2
 import numpy as np
@@ -13,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
+from mambaloc.export import TARGETS, write_bundle
 from mambaloc.export import bundle as bundle_module
-from mambaloc.export import write_bundle
 from mambaloc.export.precision import half_precision
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.models.student import LitStudent
@@ -39,7 +40,7 @@ def data(scenes):
 @pytest.fixture(scope="module", params=[False, True], ids=["tensors", "pictures"])
 def bundle(request, student, data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bundles") / "new" / "bundle"
-    deviations = write_bundle(student, data, folder, ("onnx", "fp16", "ort"), raw_input=request.param)
+    deviations = write_bundle(student, data, folder, ("onnx", "fp16", "ort"), raw_input=request.param).deviations
     return folder, deviations
 
 
@@ -71,9 +72,27 @@ def test_a_bundle_tells_an_app_what_it_needs(bundle):
     assert Localiser(folder).contract.scene == "7scenes/heads"
     assert "Conv" in (folder / "required_operators_and_types.config").read_text()
     assert (folder / "model.fp16.onnx").stat().st_size < 0.6 * (folder / "model.onnx").stat().st_size
-    card = (folder / "README.md").read_text()
-    assert "non-commercial" in card
-    assert "versions: torch 2" in card
+    assert "versions: torch 2" in (folder / "README.md").read_text()
+    assert "non-commercial" in (folder / "LICENSE.txt").read_text()
+    assert "onnxruntime-android" in (folder / "INTEGRATION.md").read_text()
+    listed = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert listed == {"contract.json", *contract["files"]}  # a digest of every file
+
+
+@pytest.mark.slow
+def test_a_bundle_tells_where_training_frames_were_taken(bundle, data):
+    sequences = json.loads((bundle[0] / "trajectory.json").read_text())["sequences"]
+    frames = data.listed_training_frames()
+    assert list(sequences) == ["seq-01", "seq-02"]
+    found = np.concatenate(list(sequences.values()))
+    np.testing.assert_allclose(found, np.hstack([frames.position_m, frames.quaternion]), atol=1e-5)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_every_kind_of_app_has_a_page(target):
+    page = (resources.files("mambaloc.export") / "integration" / f"{target}.md").read_text()
+    assert "contract.json" in page
+    assert "frames" in page
 
 
 # --- preprocessing inside ---------------------------------------------------------------------------------------------

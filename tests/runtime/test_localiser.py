@@ -14,9 +14,9 @@ from mambaloc.data.augmentation import center_crop
 from mambaloc.errors import InputError
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.geometry import canonical
+from mambaloc.images import as_rgb, read_image
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Contract, Localiser, Preprocessing, frames_of
-from mambaloc.runtime.localiser import as_rgb, read_image
 
 DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 48}
 

@@ -4,9 +4,12 @@ import runpy
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
+
+from mambaloc.data.rendering import default_intrinsics, embedded_room, embedded_shots, render
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -42,12 +45,31 @@ def bundle(run):
 def test_a_bundle_is_verified_and_localises(bundle, scenes, tmp_path, capsys):
     tool("verify_bundle", bundle)
     said = capsys.readouterr().out
-    assert said.count("as PyTorch") == 2
+    assert said.count("within bounds") == 2
     tool("localize", bundle, scenes / "heads/seq-03", "--out", tmp_path / "poses.tum")
     assert "8 poses" in capsys.readouterr().out
     poses = np.loadtxt(tmp_path / "poses.tum")
     assert poses.shape == (8, 8)
     np.testing.assert_allclose(np.linalg.norm(poses[:, 4:], axis=1), 1, atol=1e-5)
+
+
+def test_a_released_model_is_exported_by_name(tmp_path, capsys):
+    tool("export", "student.embedded_room", "--to", "int8", "--out", tmp_path / "bundle")
+    assert "int8 (all layers): median" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "bundle").glob("model*")} == {"model.int8.onnx"}
+
+
+def test_a_picture_alone_is_localised_in_the_embedded_room(tmp_path, capsys):
+    tool("localize", embedded_shot(tmp_path), "--out", tmp_path / "poses.tum")
+    assert "1 poses in embedded/room" in capsys.readouterr().out
+    (row,) = np.loadtxt(tmp_path / "poses.tum", ndmin=2)
+    assert np.linalg.norm(row[1:4] - embedded_shots()[0].world_from_cam[:3, 3]) < 0.5
+
+
+def embedded_shot(folder):
+    rgb, _ = render(embedded_room(), default_intrinsics((320, 240)), embedded_shots()[0].world_from_cam, (320, 240))
+    cv2.imwrite(str(folder / "shot.png"), rgb[..., ::-1])
+    return folder / "shot.png"
 
 
 def test_a_checkpoint_is_published(run, tmp_path, capsys):
@@ -62,12 +84,14 @@ def test_a_checkpoint_is_published(run, tmp_path, capsys):
     ("name", "words", "message"),
     [
         ("export", ["nothing.ckpt"], "nothing.ckpt: no such checkpoint"),
-        ("export", ["{run}/checkpoints/last.ckpt", "--to", "onnx,tflite"], "tflite is none of onnx, fp16, ort"),
+        ("export", ["{run}/checkpoints/last.ckpt", "--to", "onnx,tflite"], "tflite is none of onnx, fp16, int8, ort"),
+        ("export", ["student.embedded_rom"], "did you mean student.embedded_room?"),
         ("export", ["{run}/checkpoints/last.ckpt", "--out", "{run}"], "is there already"),
         ("verify_bundle", ["nothing"], "give a bundle's folder"),
         ("verify_bundle", ["{run}"], "give a bundle's folder"),
         ("localize", ["nothing.onnx", "0"], "nothing.onnx: no such model"),
         ("localize", ["{run}", "0"], "holds none of model.onnx"),
+        ("localize", ["student.embedded_rom", "0"], "did you mean student.embedded_room?"),
         ("localize", ["{run}/bundle", "nothing.mp4"], "no such file, folder or camera"),
         ("publish", ["{run}/recipe.yaml", "--tag", "a"], "recipe.yaml"),
         ("publish", ["{run}/checkpoints/last.ckpt", "--tag", "A B"], "choose another"),

@@ -132,6 +132,12 @@ CAMBRIDGE = Source(
 SOURCES = {source.name: source for source in (SEVENSCENES, CAMBRIDGE)}
 
 
+def licence_of_weights(dataset: str) -> str:
+    """Terms of weights that were trained on a dataset: its own; the project's, for scenes that it renders itself."""
+    source = SOURCES.get(dataset)
+    return f"{source.title}'s: {source.licence}; {source.terms}" if source else "Apache-2.0"
+
+
 def find_source(dataset: str) -> Source:
     """The source called ``dataset``; InputError with the nearest name where there is none."""
     if dataset not in SOURCES:

@@ -17,6 +17,7 @@ from mambaloc.data.rendering.layouts import (
     scene_note,
     write_7scenes,
 )
+from mambaloc.data.rendering.quads import Room, Vectors
 from mambaloc.data.rendering.room import furnished_room
 from mambaloc.data.rendering.shots import Shot, shots_of_sequences
 from mambaloc.data.rendering.trajectories import smooth_trajectory
@@ -58,7 +59,7 @@ def ensure_embedded_scene(root: Path) -> Path:
             return folder
         for name in names:
             if not (root / name).exists():
-                room = furnished_room(_INSIDE_M, _SEED)
+                room = embedded_room()
                 return write_7scenes(
                     root, name, shots, room=room, size=_SIZE, seed=_SEED, depth=True, depth_every=_DEPTH_EVERY
                 )
@@ -68,16 +69,20 @@ def ensure_embedded_scene(root: Path) -> Path:
 def embedded_shots() -> list[Shot]:
     """The frames of the embedded scene: four sequences to train on and two to test on, in the same volume."""
     sequences = {
-        number: smooth_trajectory(
-            _FRAMES // 2 if number in _TEST else _FRAMES,
-            seed=number,
-            inside_m=_INSIDE_M,
-            start_deg=start_deg,
-            step_deg=_STEP_DEG,
-        )
+        number: embedded_walk(_FRAMES // 2 if number in _TEST else _FRAMES, number, start_deg, _STEP_DEG)
         for number, start_deg in _STARTS_DEG.items()
     }
     return shots_of_sequences(sequences, _TEST, "seq-{sequence:02d}/frame-{frame:06d}.color.jpg")
+
+
+def embedded_room() -> Room:
+    """What there is to see in it."""
+    return furnished_room(_INSIDE_M, _SEED)
+
+
+def embedded_walk(frames: int, seed: int, start_deg: float, step_deg: float) -> Vectors:
+    """A way through it, ``world_from_cam`` (frames, 4, 4); see :func:`smooth_trajectory`."""
+    return smooth_trajectory(frames, seed=seed, inside_m=_INSIDE_M, start_deg=start_deg, step_deg=step_deg)
 
 
 def _add_missing_depth(folder: Path, shots: Iterable[Shot]) -> None:
@@ -86,7 +91,7 @@ def _add_missing_depth(folder: Path, shots: Iterable[Shot]) -> None:
         return
     with suppress(OSError), FileLock(folder.parent / f".{EMBEDDED_SCENE}.lock"):  # read-only, it stays as it is
         if missing := [shot for shot in due if not (folder / depth_file(shot)).is_file()]:
-            add_depth(folder, missing, furnished_room(_INSIDE_M, _SEED), _SIZE)
+            add_depth(folder, missing, embedded_room(), _SIZE)
 
 
 def _rendered(root: Path, names: Iterable[str], note: object) -> Path | None:

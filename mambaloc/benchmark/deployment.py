@@ -1,0 +1,142 @@
+"""What a trained system costs and loses on a device: PyTorch beside ONNX Runtime in three precisions."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median, quantiles
+from tempfile import TemporaryDirectory
+
+import onnx
+import onnxruntime
+import torch
+from torch import Tensor
+
+from mambaloc.benchmark.latency import in_turns
+from mambaloc.data import PoseDataModule
+from mambaloc.errors import InputError
+from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.export import contract_of, export_onnx
+from mambaloc.export.precision import half_precision
+from mambaloc.export.quantisation import eight_bit, median_errors
+from mambaloc.metrics import summarise
+from mambaloc.models import LitPoseRegressor
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """One form of one system.
+
+    Args:
+        name: of the system.
+        form: ``PyTorch``, ``float32``, ``float16`` or ``int8``; the last three on ONNX Runtime.
+        size: bytes of its file.
+        latency_s: of one image, each repetition.
+        position_error_m: median over the test frames.
+        rotation_error_deg: likewise.
+        note: what else is to be known of it.
+    """
+
+    name: str
+    form: str
+    size: int
+    latency_s: list[float]
+    position_error_m: float
+    rotation_error_deg: float
+    note: str = ""
+
+    @property
+    def spread_s(self) -> float:
+        """Interquartile range of the latency."""
+        low, _, high = quantiles(self.latency_s, n=4)
+        return high - low
+
+
+@dataclass(frozen=True)
+class _Form:
+    size: int
+    call: Callable[[], object]
+    errors: Mapping[str, float]
+    note: str = ""
+
+
+def measure_deployment(
+    systems: Mapping[str, tuple[LitPoseRegressor, PoseDataModule]], threads: int = 2, repetitions: int = 50
+) -> list[Deployment]:
+    """Measure every form of some trained systems; their latencies are taken in turns, batch 1, preprocessing apart.
+
+    Args:
+        systems: by name, each with the data that it was trained with.
+        threads: that one image may use.
+        repetitions: of each latency.
+
+    Raises:
+        InputError: for too few repetitions, or frames that are not there.
+    """
+    if repetitions < 4:
+        raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        forms = {
+            (name, form): measured
+            for name, (system, data) in systems.items()
+            for form, measured in _forms(system.cpu().eval(), data, threads).items()
+        }
+        latencies = in_turns([form.call for form in forms.values()], repetitions)
+    finally:
+        torch.set_num_threads(before)
+    return [
+        Deployment(
+            *names, form.size, taken, form.errors["position_error_m"], form.errors["rotation_error_deg"], form.note
+        )
+        for (names, form), taken in zip(forms.items(), latencies, strict=True)
+    ]
+
+
+def speed_up(deployments: Sequence[Deployment], each: Deployment) -> float:
+    """How many times faster a form is than the first of them."""
+    return median(deployments[0].latency_s) / median(each.latency_s)
+
+
+def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict[str, _Form]:
+    image = torch.rand(1, 3, *system.image_size, generator=torch.Generator().manual_seed(0))
+    with TemporaryDirectory() as folder:
+        export_onnx(system, Path(folder, "model.onnx"), contract_of(system, data.hparams))
+        exported = onnx.load(Path(folder, "model.onnx"))
+    weights = io.BytesIO()
+    torch.save(system.network.state_dict(), weights)
+    forms = {
+        "PyTorch": _Form(weights.tell(), _eager(system, image), summarise(localise_test_frames(system, data, "cpu"))),
+        "float32": _on_onnx_runtime(exported, image, threads, median_errors(exported, data)),
+    }
+    half = half_precision(onnx.ModelProto.FromString(exported.SerializeToString()))
+    forms["float16"] = _on_onnx_runtime(half, image, threads, median_errors(half, data))
+    int8 = eight_bit(exported, data)
+    errors = {"position_error_m": int8.position_error_m, "rotation_error_deg": int8.rotation_error_deg}
+    note = int8.kind if int8.fits else f"{int8.kind}, {int8.loss:+.0%}: not shipped"
+    forms["int8"] = _on_onnx_runtime(int8.model, image, threads, errors, note)
+    return forms
+
+
+def _eager(system: LitPoseRegressor, image: Tensor) -> Callable[[], object]:
+    def call() -> object:
+        with torch.inference_mode():
+            return system(image)
+
+    return call
+
+
+def _on_onnx_runtime(
+    model: onnx.ModelProto, image: Tensor, threads: int, errors: Mapping[str, float], note: str = ""
+) -> _Form:
+    content = model.SerializeToString()
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    options.intra_op_num_threads = threads
+    options.add_session_config_entry("session.force_spinning_stop", "1")  # else it disturbs whose turn is next
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    feed = {"image": image.numpy()}
+    return _Form(len(content), lambda: session.run(None, feed), errors, note)

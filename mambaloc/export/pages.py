@@ -1,0 +1,71 @@
+"""What a bundle says to people: its card, its licence, and how an app uses it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from mambaloc.data.download.origins import licence_of_weights
+from mambaloc.runtime.contract import Contract
+
+TARGETS = ("android", "ios", "react_native", "web", "pc")
+"""Kinds of app that there is a page on integration for."""
+
+_INTEGRATION = files("mambaloc.export") / "integration"
+
+
+def write_pages(folder: Path, contract: Contract, dataset: str, models: Sequence[str], target: str) -> None:
+    """Write ``README.md``, ``LICENSE.txt`` and ``INTEGRATION.md``.
+
+    Args:
+        folder: the bundle.
+        contract: of its models.
+        dataset: that they were trained on.
+        models: their files.
+        target: of ``TARGETS``.
+    """
+    page = (_INTEGRATION / f"{target}.md").read_text(encoding="utf-8")
+    for name, text in (
+        ("README.md", _card(contract, models)),
+        ("LICENSE.txt", _licence(dataset)),
+        ("INTEGRATION.md", page),
+    ):
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def _licence(dataset: str) -> str:
+    return f"""Code and architecture: Apache-2.0.
+
+The weights follow the terms of the frames that they were trained on, and so do frames/ and trajectory.json, which
+hold some of those frames and their poses: {licence_of_weights(dataset)}
+"""
+
+
+def _card(contract: Contract, models: Sequence[str]) -> str:
+    listed = "\n".join(f"- `{name}`" for name in models)
+    trained = "\n".join(
+        f"- {name}: {_in_words(value)}" for name, value in contract.trained.items() if value is not None
+    )
+    return f"""# {contract.model} on {contract.scene}
+
+Camera pose of one RGB image, {contract.pose}.
+
+{listed}
+- `contract.json`: what the models are fed and say, digests, and the poses of `frames/` that a port must find
+- `trajectory.json`: where the training frames were taken
+- `INTEGRATION.md`: how an app uses it
+- `LICENSE.txt`
+
+`python tools/verify_bundle.py FOLDER` checks it, `python tools/demo.py FOLDER` shows it in a browser. An app ships a
+model and `contract.json`; `frames/` are for checking a port.
+
+## Trained
+
+{trained}
+"""
+
+
+def _in_words(value: Any) -> str:
+    return ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else str(value)

@@ -1,0 +1,168 @@
+"""Eight-bit integers: the same network a quarter of the size, of value only if the poses stay."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization.shape_inference import quant_pre_process
+
+from mambaloc.data import PoseDataModule
+from mambaloc.errors import InputError
+from mambaloc.metrics import PoseErrors, summarise
+from mambaloc.types import PosePrediction
+
+LARGEST_LOSS = 0.1
+"""Share of a median error that eight bits may add to it."""
+
+_PRODUCTS = ("Conv", "MatMul", "Gemm")  # what becomes integer products; all else stays in floating point
+_CLIPS = ("Clip", "Relu")  # after a product they go into its scale, which then covers no value that they cut off
+_CALIBRATION_FRAMES = 64
+
+
+@dataclass(frozen=True)
+class EightBit:
+    """A quantised network and what it lost.
+
+    Args:
+        model: the network.
+        kind: ``all layers``, or ``mixed``: the first layer, the heads and squeeze-excitation's gates in float32.
+        position_error_m: median over the test frames.
+        rotation_error_deg: likewise.
+        loss: by how much of itself the median error grew, the larger of position's and rotation's.
+        frames: test frames that this was measured, and decided, on.
+    """
+
+    model: onnx.ModelProto
+    kind: str
+    position_error_m: float
+    rotation_error_deg: float
+    loss: float
+    frames: int
+
+    @property
+    def fits(self) -> bool:
+        """Whether it lost little enough to be of use."""
+        return self.loss < LARGEST_LOSS  # not where it is NaN
+
+    def __str__(self) -> str:
+        errors = f"median {self.position_error_m:.3f} m and {self.rotation_error_deg:.2f}° on {self.frames} test frames"
+        said = f"int8 ({self.kind}): {errors}, {self.loss:+.1%} at most to float32's"
+        return said if self.fits else f"{said}; {LARGEST_LOSS:.0%} is allowed, so it was left out; take fp16"
+
+
+def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> EightBit:
+    """Quantise a network after training: all layers if the errors allow it, else without the most sensitive ones.
+
+    Args:
+        model: a network as :func:`~mambaloc.export.export_onnx` writes it.
+        data: what it was trained with: training frames to calibrate on, test frames to measure on.
+
+    Raises:
+        InputError: where the frames are not there.
+    """
+    data.setup("fit")
+    data.setup("test")
+    prepared = _prepared(model)
+    before = median_errors(model, data)
+    images, count = _calibration_images(data), len(data.frames("test"))
+    for kind, kept in (("all layers", []), ("mixed", sensitive_nodes(prepared.graph))):
+        quantised = _quantised(prepared, images, kept)
+        after = median_errors(quantised, data)
+        position_m, rotation_deg = (after[name] for name in ("position_error_m", "rotation_error_deg"))
+        loss = max(position_m / before["position_error_m"], rotation_deg / before["rotation_error_deg"]) - 1
+        found = EightBit(quantised, kind, position_m, rotation_deg, loss, count)
+        if found.fits:
+            break
+    return found
+
+
+def median_errors(model: onnx.ModelProto, data: PoseDataModule) -> dict[str, float]:
+    """Errors of a network in ONNX Runtime over the test frames, as :func:`mambaloc.metrics.summarise` tells them."""
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    errors = PoseErrors()
+    for fetched in data.test_dataloader():
+        batch = data.on_after_batch_transfer(fetched, 0)
+        position_m, quaternion = (torch.from_numpy(o) for o in session.run(None, {"image": batch.image.numpy()}))
+        errors.update(PosePrediction(position_m, quaternion), batch)
+    return summarise(errors.table())
+
+
+def sensitive_nodes(graph: onnx.GraphProto) -> list[str]:
+    """Names of the layers that eight bits hurt most: the first, the heads, and squeeze-excitation's gates."""
+    layers = [node for node in graph.node if node.op_type in _PRODUCTS]
+    gates = [node for node in layers if _is_of_one_pixel(graph, node)]
+    heads = [node for node in layers if node.op_type != "Conv"]
+    return [node.name for node in (layers[0], *gates, *heads)]
+
+
+def _is_of_one_pixel(graph: onnx.GraphProto, node: onnx.NodeProto) -> bool:
+    shapes = {value.name: value.type.tensor_type.shape.dim for value in graph.value_info}
+    return node.op_type == "Conv" and [d.dim_value for d in shapes.get(node.output[0], [])][2:] == [1, 1]
+
+
+def _prepared(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Fold and fuse what would otherwise be rounded twice: batch normalisation into convolutions."""
+    with TemporaryDirectory() as folder:
+        source, out = Path(folder, "as_exported.onnx"), Path(folder, "prepared.onnx")
+        onnx.save(model, source)
+        quant_pre_process(source, out, skip_symbolic_shape=True)
+        return onnx.load(out)
+
+
+def _calibration_images(data: PoseDataModule) -> list[NDArray[np.float32]]:
+    images = torch.cat(list(data.centred_training_images()))
+    if not len(images):
+        raise InputError(f"{data.folder}: holds no training frame to calibrate int8 on; leave int8 out of --to")
+    rows = np.linspace(0, len(images) - 1, min(_CALIBRATION_FRAMES, len(images))).round().astype(int)
+    return [images[row][None].numpy() for row in rows]
+
+
+def _quantised(model: onnx.ModelProto, images: Sequence[NDArray[np.float32]], kept: Sequence[str]) -> onnx.ModelProto:
+    """Static QDQ: unsigned activations, signed weights with a scale for each channel.
+
+    All eight bits of a weight: in seven, which ONNX Runtime advises for x86 processors without VNNI, MobileNetV2's
+    poses were two to four times as far from float32's, on such a processor.
+    """
+    with TemporaryDirectory() as folder:
+        source, out = Path(folder, "float.onnx"), Path(folder, "int8.onnx")
+        onnx.save(model, source)
+        before = logging.root.manager.disable
+        logging.disable(logging.WARNING)  # it asks for the preparation that was done
+        try:
+            quantize_static(
+                source,
+                out,
+                _Images(images),
+                quant_format=QuantFormat.QDQ,
+                op_types_to_quantize=[*_PRODUCTS, *_CLIPS],
+                per_channel=True,
+                activation_type=QuantType.QUInt8,
+                weight_type=QuantType.QInt8,
+                nodes_to_exclude=list(kept),
+            )
+        finally:
+            logging.disable(before)
+        return onnx.load(out)
+
+
+class _Images(CalibrationDataReader):
+    def __init__(self, images: Sequence[NDArray[np.float32]]) -> None:
+        self._left: Iterator[NDArray[np.float32]] = iter(images)
+
+    def get_next(self) -> dict[str, Any] | None:
+        """One image, or None after the last."""
+        image = next(self._left, None)
+        return None if image is None else {"image": image}

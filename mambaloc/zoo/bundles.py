@@ -1,0 +1,54 @@
+"""Released models as bundles: exported once, then found again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mambaloc import __version__
+from mambaloc.data import PoseDataModule
+from mambaloc.data.cache import default_cache_dir
+from mambaloc.evaluation.evaluate import data_of
+from mambaloc.export import write_bundle
+from mambaloc.files import made_once
+from mambaloc.models import LitPoseRegressor
+from mambaloc.models.base import read_checkpoint
+from mambaloc.zoo.loading import load, released_folder
+from mambaloc.zoo.manifest import Manifest
+
+EMBEDDED = "student.embedded_room"
+"""The released model that comes with the package."""
+
+
+def load_with_data(source: str, root: str | None = None) -> tuple[LitPoseRegressor, PoseDataModule]:
+    """Load a trained system, and what it was trained with.
+
+    Args:
+        source: as :func:`mambaloc.load` takes it.
+        root: folder that holds its scene; as in training, or the dataset's default, unless given.
+
+    Raises:
+        InputError: as :func:`mambaloc.load`.
+    """
+    system = load(source)
+    if Path(source).is_file():
+        data = data_of(read_checkpoint(source), Path(source))
+        return system, data if root is None else PoseDataModule(**{**data.hparams, "root": root})
+    manifest = Manifest.read(released_folder(source))
+    dataset, _, scene = manifest.scene.partition("/")
+    data = PoseDataModule(dataset, root, scene, image_size=system.image_size, short_side=manifest.short_side)
+    return system, data
+
+
+def released_bundle(name: str = EMBEDDED) -> Path:
+    """The bundle of a released model, exported into the user's cache on first use (half a minute).
+
+    Raises:
+        InputError: where there is no such model, or its scene's frames are not there.
+    """
+    digest = Manifest.read(released_folder(name)).weights_sha256[:12]
+    folder = default_cache_dir() / "bundles" / f"{name.rpartition('/')[2]}-{digest}-{__version__}"
+
+    def make(partial: Path) -> None:
+        write_bundle(*load_with_data(name), partial / "bundle", ("onnx",), target="pc")
+
+    return made_once(folder, make) / "bundle"
