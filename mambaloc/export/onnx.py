@@ -30,10 +30,17 @@ _CHECKED_BATCHES = (1, 3)
 
 @dataclass(frozen=True)
 class Parity:
-    """Largest difference between ONNX Runtime and PyTorch."""
+    """Largest difference between ONNX Runtime and PyTorch.
+
+    Args:
+        position_m: of positions.
+        rotation_deg: of rotations.
+        reach_m: largest distance from the scene's origin that PyTorch said; float32 rounds in proportion to it.
+    """
 
     position_m: float
     rotation_deg: float
+    reach_m: float
 
 
 class DeployedNetwork(nn.Module):
@@ -62,7 +69,8 @@ def export_onnx(
         system: trained; left as it was.
         path: the file; it appears only once it is complete and has passed.
         contract: what the file tells of itself; :func:`contract_of` makes it.
-        tolerance_m: largest position difference allowed, in metres per metre of the scene's size (at least one).
+        tolerance_m: largest position difference allowed, in metres per metre of the scene's size (at least one) or of
+            the distance that the network says: noise may lead it far out of the scene.
         tolerance_deg: largest rotation difference allowed.
 
     Raises:
@@ -74,7 +82,7 @@ def export_onnx(
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(deployed, contract, partial)
         parity = check_parity(deployed, partial, system.image_size)
-        size_m = max(1.0, _largest_position_m(deployed))
+        size_m = max(1.0, _largest_position_m(deployed), parity.reach_m)
         if not (parity.position_m <= tolerance_m * size_m and parity.rotation_deg <= tolerance_deg):
             raise InputError(
                 f"{path}: ONNX Runtime differs from PyTorch by {parity.position_m:.2g} m and "
@@ -114,7 +122,7 @@ def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], s
     """Compare a file with the network it came from, on random images in several batch sizes."""
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     generator = torch.Generator().manual_seed(seed)
-    position_m, rotation_deg = [], []
+    position_m, rotation_deg, reach_m = [], [], []
     for batch in _CHECKED_BATCHES:
         image = torch.rand(batch, 3, *image_size, generator=generator)
         with torch.inference_mode():
@@ -122,7 +130,8 @@ def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], s
         actual_m, actual_q = (torch.from_numpy(a) for a in session.run(None, {"image": image.numpy()}))
         position_m.append((actual_m - expected_m).norm(dim=-1).max())
         rotation_deg.append(rotation_error_deg(actual_q, expected_q).max())
-    return Parity(torch.stack(position_m).max().item(), torch.stack(rotation_deg).max().item())  # NaN stays NaN
+        reach_m.append(expected_m.norm(dim=-1).max())
+    return Parity(*(torch.stack(each).max().item() for each in (position_m, rotation_deg, reach_m)))  # NaN stays NaN
 
 
 def _write(deployed: nn.Module, contract: Contract, path: Path) -> None:

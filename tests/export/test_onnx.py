@@ -106,6 +106,18 @@ def test_the_file_is_alone_and_complete(exported):
     assert exported.path.stat().st_size > 4 * trained
 
 
+def test_a_network_that_noise_leads_far_away_may_round_in_proportion(tmp_path):
+    """10 km away float32 knows millimetres, ten times as coarse as at 1 km: no difference of the file's."""
+    torch.manual_seed(0)
+    system = tiny()
+    with torch.no_grad():
+        for parameter in system.network.head.position.parameters():
+            parameter.mul_(1e4)
+    parity = export_onnx(system, tmp_path / "model.onnx", contract_of(system, DATA), tolerance_m=1e-5)
+    assert parity.reach_m > 1e3
+    assert 1e-5 < parity.position_m < 1e-5 * parity.reach_m
+
+
 def test_parity_is_reported(exported):
     assert 0 <= exported.parity.position_m < 1e-2
     assert 0 <= exported.parity.rotation_deg < 0.05

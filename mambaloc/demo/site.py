@@ -1,0 +1,97 @@
+"""The demo page as a folder of static files, which any web server may serve."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+from functools import partial
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from rich.console import Console
+
+from mambaloc.data.cache import default_cache_dir
+from mambaloc.demo.film import POSES_FILE
+from mambaloc.errors import InputError
+from mambaloc.files import made_once, whole_folder
+from mambaloc.runtime.bundle import CONTRACT_FILE, verify_bundle
+
+_WEB = files("mambaloc.demo") / "web"
+_VENDORED = "vendor.json"  # the site's files that come from npm, and where they lie in node_modules
+_NPM_FILES = ("package.json", "package-lock.json", ".npmrc")
+
+
+def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
+    """Write the page for a bundle; the folder appears once it is whole.
+
+    Args:
+        bundle: which :func:`~mambaloc.runtime.bundle.verify_bundle` finds as it was written.
+        out: the folder, which must not be there yet.
+        film: a video for the page to play, or a folder of one with its true poses; see :func:`embedded_film`.
+
+    Raises:
+        InputError: for a bundle or film that is none, a folder that cannot be written, or without Node.js's npm.
+    """
+    verify_bundle(bundle)
+    if out.exists():
+        raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
+    modules = node_modules()
+    with whole_folder(out, "choose another folder with --out") as site:
+        with as_file(_WEB) as web:
+            shutil.copytree(web, site, dirs_exist_ok=True, ignore=shutil.ignore_patterns(_VENDORED, *_NPM_FILES))
+        for name, source in json.loads((_WEB / _VENDORED).read_text(encoding="utf-8")).items():
+            (site / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(modules / source, site / name)
+        for name in _listed(bundle):
+            (site / "bundle" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(bundle / name, site / "bundle" / name)
+        if film is not None:
+            _add_film(site, film)
+    return out
+
+
+def node_modules(dev: bool = False) -> Path:
+    """What the page needs of npm, as ``package-lock.json`` pins it; installed into the user's cache on first use.
+
+    Args:
+        dev: also what only its tests need.
+
+    Raises:
+        InputError: where npm is not there, or does not install it.
+    """
+    lock = (_WEB / "package-lock.json").read_bytes()
+    name = hashlib.sha256(lock).hexdigest()[:12] + ("-dev" if dev else "")
+    return made_once(default_cache_dir() / "node" / name, partial(_install, dev=dev)) / "node_modules"
+
+
+def _install(folder: Path, dev: bool) -> None:
+    for name in _NPM_FILES:
+        (folder / name).write_bytes((_WEB / name).read_bytes())
+    npm = shutil.which("npm")
+    if npm is None:
+        raise InputError("npm: not found, and the page's libraries come from it; install Node.js 20 or later")
+    command = [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", *([] if dev else ["--omit=dev"])]
+    with Console(stderr=True).status("fetching the page's libraries, once"):
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        reason = next((line for line in done.stderr.splitlines() if line.strip()), "no reason given")
+        raise InputError(f"npm ci: failed ({reason.strip()}); is there a network?")
+
+
+def _listed(bundle: Path) -> list[str]:
+    contract = json.loads((bundle / CONTRACT_FILE).read_text(encoding="utf-8"))
+    return [CONTRACT_FILE, *contract["files"]]
+
+
+def _add_film(site: Path, film: Path) -> None:
+    try:
+        if film.is_dir():
+            shutil.copytree(film, site, dirs_exist_ok=True)
+            return
+        file = f"film{film.suffix.lower()}"
+        shutil.copyfile(film, site / file)
+    except FileNotFoundError:
+        raise InputError(f"{film}: no such film; give a video that browsers play") from None
+    (site / POSES_FILE).write_text(json.dumps({"file": file}) + "\n", encoding="utf-8")

@@ -1,0 +1,304 @@
+/** The page: what is chosen, what runs, what is said. */
+
+import { describe } from "./about.js";
+import { Engine } from "./engine.js";
+import { TestFrames } from "./frames.js";
+import { poseOf } from "./geometry.js";
+import { deviation, modelOf } from "./localiser.js";
+import { Readout } from "./readout.js";
+import { Film, Stream, decoded, openCamera, optionalJson } from "./sources.js";
+import { View } from "./view.js";
+
+const $ = (id) => document.getElementById(id);
+const query = new URLSearchParams(location.search);
+const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+let engine = null;
+let contract = null;
+let view = null;
+let readout = null;
+let frames = null;
+let film = null;
+let stream = null;
+let source = "";
+let visit = 0; // counts choices of a source; what an earlier one still answers is dropped
+
+async function main() {
+  const files = ["bundle/trajectory.json", "film.json"];
+  const [trajectory, description] = await Promise.all(files.map(optionalJson));
+  const sequences = trajectory?.sequences ?? {};
+  openView(sequences);
+  readout = new Readout(view?.up ?? null);
+  if (description) film = new Film(description);
+  $("film-note").textContent = film?.poses ? "A film whose true poses are known." : "";
+  $("offer-film").hidden = !film;
+  document.querySelector(".key .path").hidden = !Object.keys(sequences).length;
+  listen();
+  await load(query.get("backend") ?? "auto");
+}
+
+/** Load the model, and go on with the source that is chosen, or the best there is. */
+async function load(backend) {
+  await startEngine(backend);
+  const wanted = source || query.get("source");
+  const offered = ["camera", "photo", "frames", ...(film ? ["film"] : [])];
+  await choose(offered.includes(wanted) ? wanted : offered.at(-1));
+}
+
+function openView(sequences) {
+  try {
+    view = new View($("scene"), sequences);
+    $("grid-step").textContent = `grid ${view.gridStep} m`;
+    setFollowing(!Object.keys(sequences).length); // nothing else says where to look
+  } catch {
+    document.querySelector(".view").classList.add("flat");
+    $("flat").hidden = false;
+  }
+}
+
+function listen() {
+  for (const input of document.querySelectorAll('[name="source"]')) {
+    // Not "change": what failed may be chosen again.
+    input.addEventListener("click", () => {
+      if (input.value !== source || document.body.dataset.state === "error") choose(input.value);
+    });
+  }
+  for (const input of document.querySelectorAll('[name="backend"]')) {
+    input.addEventListener("change", () => changeBackend(input.value));
+  }
+  $("photo").addEventListener("change", ({ target }) => takeFile(target.files[0]));
+  $("photo").addEventListener("click", ({ target }) => (target.value = "")); // the same file may be chosen again
+  addEventListener("dragover", (event) => event.preventDefault());
+  addEventListener("drop", (event) => {
+    event.preventDefault();
+    takeFile(event.dataTransfer.files[0]);
+  });
+  $("play").addEventListener("click", () => ($("video").paused ? $("video").play() : $("video").pause()));
+  for (const event of ["play", "pause"]) $("video").addEventListener(event, showPlaying);
+  $("video").addEventListener("error", ({ target }) => {
+    if (target.hasAttribute("src")) fail(new Error("This browser cannot play the film: choose another source."));
+  });
+  $("check").addEventListener("click", () => frames?.checkAll());
+  $("reset").addEventListener("click", () => view?.reset());
+  $("follow").addEventListener("click", () => setFollowing(!view.follows));
+}
+
+function setFollowing(follows) {
+  view.follows = follows;
+  $("follow").setAttribute("aria-pressed", String(follows));
+}
+
+function showPlaying() {
+  const { paused } = $("video");
+  $("play").textContent = paused ? "Play" : "Pause";
+  if (source === "film" && stream && paused && document.body.dataset.state === "running") setState("ready", "Paused");
+}
+
+/** Start the model on the backend that is wanted, or the one that works; `engine` stays null if none does. */
+async function startEngine(backend) {
+  setState("loading", "Loading…");
+  $("loading").hidden = false;
+  $("backends").disabled = true;
+  try {
+    engine = await Engine.start(backend, showProgress);
+  } catch (error) {
+    return fail(error);
+  } finally {
+    $("loading").hidden = true;
+    $("backends").disabled = false;
+  }
+  const { info } = engine;
+  contract = info.contract;
+  document.body.dataset.backend = info.backend;
+  $("model-line").textContent = `${contract.model} · ${contract.scene}`;
+  $("wasm-name").textContent = info.backend === "wasm" ? `WASM, ${threads(info.threads)}` : "WASM";
+  for (const input of document.querySelectorAll('[name="backend"]')) {
+    input.checked = input.value === info.backend;
+    if (input.value === "webgpu") input.disabled = !info.webgpu;
+  }
+  $("sideways").hidden = contract.preprocessing.crop[1] <= contract.preprocessing.short_side;
+  note(info.note);
+  describe($("about"), contract, info.verified);
+  frames = new TestFrames($("frames"), $("verdict"), contract, allowed(), takeFrame);
+  setState("ready", "Ready");
+}
+
+async function changeBackend(backend) {
+  leave();
+  engine?.stop();
+  engine = null;
+  await load(backend);
+}
+
+/** Leave the source that is on, and go to another. */
+async function choose(name) {
+  source = name;
+  if (!engine) return; // until the model is there
+  leave();
+  const turn = visit;
+  document.querySelector(`[name="source"][value="${name}"]`).checked = true;
+  for (const control of document.querySelectorAll(".control")) control.hidden = control.dataset.for !== name;
+  const truePath = name === "film" ? film.poses : null;
+  document.querySelector(".key .truth").hidden = !truePath;
+  view?.showTruePath(truePath);
+  setState("ready", { photo: "Choose a photo", frames: "Choose a frame" }[name] ?? "Starting…");
+  try {
+    if (name === "film") await startFilm(turn);
+    if (name === "camera") await startCamera(turn);
+  } catch (error) {
+    if (turn === visit) fail(error);
+  }
+}
+
+function leave() {
+  visit += 1;
+  stream?.stop();
+  stream = null;
+  const video = $("video");
+  video.pause();
+  for (const track of video.srcObject?.getTracks() ?? []) track.stop();
+  video.srcObject = null;
+  video.removeAttribute("src");
+  video.load();
+  for (const id of ["video", "still", "crop", "error"]) $(id).hidden = true;
+  view?.clear();
+  readout.restart();
+}
+
+async function startFilm(turn) {
+  const url = await film.url();
+  if (turn !== visit) return;
+  const video = $("video");
+  video.loop = true;
+  video.src = url;
+  video.hidden = false;
+  startStream(film.poses && ((seconds) => film.frameAt(seconds)));
+  if (!calm) await video.play().catch(() => {}); // the browser may want a tap first
+  if (video.paused) setState("ready", "Press Play");
+}
+
+async function startCamera(turn) {
+  const media = await openCamera();
+  if (turn !== visit) return media.getTracks().forEach((track) => track.stop());
+  const video = $("video");
+  video.srcObject = media;
+  video.hidden = false;
+  media.getVideoTracks()[0].addEventListener("ended", () => {
+    if (turn === visit) fail(new Error("The camera went away: choose Camera again."));
+  });
+  await video.play();
+  startStream();
+}
+
+/** Localise frame after frame. `frameAt` gives the number of a frame whose true pose is known. */
+function startStream(frameAt = null) {
+  const turn = visit;
+  stream = new Stream($("video"), async (bitmap, seconds) => {
+    try {
+      const frame = frameAt?.(seconds);
+      const truth = frameAt && poseOf(film.poses[frame]);
+      const pose = await localise(bitmap, truth);
+      if (turn !== visit) return;
+      if (truth) readout.showError(pose, truth, frame);
+      readout.show(pose, source);
+      if (!$("video").paused) setState("running", "Running");
+    } catch (error) {
+      if (turn === visit) fail(error);
+    }
+  });
+}
+
+/** Localise one picture and show where it was taken; null if another source was chosen meanwhile. */
+async function localise(bitmap, truth = null) {
+  const turn = visit;
+  const { width, height } = bitmap;
+  view?.setPicture(bitmap, width, height);
+  showCrop(width, height);
+  const pose = await engine.localise(bitmap);
+  if (turn === visit) {
+    $("error").hidden = true;
+    view?.show(pose, truth);
+  }
+  return pose;
+}
+
+/** Localise a picture that does not move. */
+async function localiseStill(blob, name, frame = null) {
+  const turn = visit;
+  try {
+    const bitmap = await decoded(blob, name);
+    const canvas = Object.assign($("still"), { width: bitmap.width, height: bitmap.height, hidden: false });
+    canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    const pose = await localise(bitmap);
+    if (turn !== visit) return null;
+    if (frame) readout.showDeviation(deviation(pose, frame), allowed());
+    else readout.forgetErrors();
+    readout.show(pose, source, frame?.file);
+    setState("ready", "Localised");
+    return pose;
+  } catch (error) {
+    if (turn === visit) fail(error);
+    return null;
+  }
+}
+
+async function takeFile(file) {
+  if (!file || !engine) return;
+  if (source !== "photo") await choose("photo");
+  await localiseStill(file, file.name);
+}
+
+async function takeFrame(frame) {
+  const response = await fetch(`bundle/${frame.file}`).catch(() => null);
+  if (response?.ok) return localiseStill(await response.blob(), frame.file, frame);
+  fail(new Error(`${frame.file} cannot be fetched; is the server still running?`));
+  return null;
+}
+
+/** Outline the part of the picture that the model sees. */
+function showCrop(width, height) {
+  const { short_side, crop } = contract.preprocessing;
+  const scale = short_side / Math.min(width, height);
+  const [share, across] = [crop[0] / (height * scale), crop[1] / (width * scale)];
+  $("crop").hidden = share > 1 || across > 1;
+  $("crop").style.setProperty("--height", `${100 * share}%`);
+  $("crop").style.setProperty("--width", `${100 * across}%`);
+  document.querySelector(".picture").style.setProperty("--aspect", width / height);
+}
+
+function showProgress({ name, loaded, total }) {
+  const bar = $("progress");
+  const megabytes = (bytes) => (bytes / 1e6).toFixed(1);
+  bar.previousElementSibling.textContent =
+    `Loading the ${name}, ${megabytes(loaded)}${total ? ` of ${megabytes(total)}` : ""} MB`;
+  if (total) Object.assign(bar, { max: total, value: loaded });
+  else bar.removeAttribute("value");
+}
+
+function setState(state, text) {
+  document.body.dataset.state = state;
+  if ($("status").textContent !== text) $("status").textContent = text;
+}
+
+function fail(error) {
+  if ($("error").hidden || $("error").textContent !== error.message) $("error").textContent = error.message;
+  $("error").hidden = false;
+  view?.clear();
+  setState("error", "No pose");
+}
+
+function note(text) {
+  $("note").textContent = text;
+  $("note").hidden = !text;
+}
+
+/** How far the model may be from PyTorch. */
+function allowed() {
+  return contract.files[modelOf(contract)].allowed;
+}
+
+function threads(count) {
+  return `${count} ${count === 1 ? "thread" : "threads"}`;
+}
+
+main().catch(fail);

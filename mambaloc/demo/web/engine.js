@@ -1,0 +1,67 @@
+/** The page's side of the worker: promises instead of messages. */
+
+/** A running model. One at a time: {@link Engine#stop} the last before starting another. */
+export class Engine {
+  #worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
+  #waiting = new Map();
+  #count = 0;
+
+  /**
+   * Load the model.
+   * @param {"auto"|"wasm"|"webgpu"} backend wanted; `info.backend` is the one that runs.
+   * @param {(progress: {name: string, loaded: number, total: number}) => void} onProgress of the downloads.
+   */
+  static async start(backend, onProgress) {
+    const engine = new Engine();
+    try {
+      engine.info = await engine.#started(backend, onProgress);
+    } catch (error) {
+      engine.stop();
+      throw error;
+    }
+    return engine;
+  }
+
+  /** Localise a bitmap, which the worker takes. */
+  localise(bitmap) {
+    const id = (this.#count += 1);
+    return new Promise((resolve, reject) => {
+      this.#waiting.set(id, { resolve, reject });
+      this.#worker.postMessage({ type: "localise", id, bitmap }, [bitmap]);
+    });
+  }
+
+  stop() {
+    this.#worker.terminate();
+    this.#abandon(new Error("The model was stopped."));
+  }
+
+  #abandon(error) {
+    for (const { reject } of this.#waiting.values()) reject(error);
+    this.#waiting.clear();
+  }
+
+  #started(backend, onProgress) {
+    return new Promise((resolve, reject) => {
+      this.#worker.onerror = ({ message }) => {
+        const error = new Error(`The model's worker failed (${message || "no reason given"}); load the page again.`);
+        reject(error);
+        this.#abandon(error);
+      };
+      this.#worker.onmessage = ({ data }) => {
+        if (data.type === "progress") onProgress(data);
+        else if (data.type === "ready") resolve(data);
+        else if (data.id === undefined) reject(new Error(data.message));
+        else this.#settle(data);
+      };
+      this.#worker.postMessage({ type: "start", backend });
+    });
+  }
+
+  #settle({ id, type, pose, message }) {
+    const waiting = this.#waiting.get(id);
+    this.#waiting.delete(id);
+    if (type === "pose") waiting?.resolve(pose);
+    else waiting?.reject(new Error(message));
+  }
+}

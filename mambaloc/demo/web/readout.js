@@ -1,0 +1,124 @@
+/** The numbers on the page. */
+
+import { attitude, median } from "./geometry.js";
+import { deviation } from "./localiser.js";
+
+const LATENCIES = 30;
+const RATE_WINDOW_MS = 2000;
+
+const shown = (name) => document.querySelector(`[data-show="${name}"]`);
+const signed = (value, digits) => value.toFixed(digits).replace("-", "−"); // a minus as wide as a plus
+
+/** A number that is no smaller than it reads: "< 0.001" rather than "0.000". */
+export function small(value, digits) {
+  return value < 10 ** -digits ? `< ${10 ** -digits}` : value.toFixed(digits);
+}
+
+/** Shows poses, their errors, and how fast they come. */
+export class Readout {
+  #element = document.getElementById("pose");
+  #count = 0;
+  #latencies = [];
+  #times = [];
+  #errors = [];
+  #last = -1;
+
+  /** @param {number[]|null} up of the scene; without it there is no attitude to show. */
+  constructor(up) {
+    this.up = up;
+    for (const cell of document.querySelectorAll(".attitude")) cell.hidden = !up;
+  }
+
+  /** Start over, with another source or a new run of the film. */
+  restart() {
+    this.#latencies = [];
+    this.#times = [];
+    this.forgetErrors();
+    for (const name of ["fps", "latency"]) shown(name).textContent = "–";
+    shown("latency-detail").textContent = "";
+  }
+
+  forgetErrors() {
+    this.#errors = [];
+    this.#last = -1;
+    delete this.#element.dataset.filmFrame;
+    document.getElementById("errors").hidden = true;
+  }
+
+  /**
+   * Show one answer.
+   * @param pose of the localiser.
+   * @param {string} source that the picture is from.
+   * @param {string} file of a test frame, or "".
+   */
+  show(pose, source, file = "") {
+    const { position_m, quaternion_wxyz } = pose;
+    const data = this.#element.dataset;
+    data.positionM = JSON.stringify(position_m);
+    data.quaternionWxyz = JSON.stringify(quaternion_wxyz);
+    data.source = source;
+    data.frameFile = file;
+    ["x", "y", "z"].forEach((axis, i) => (shown(axis).textContent = signed(position_m[i], 3)));
+    shown("quaternion").textContent = quaternion_wxyz.map((value) => signed(value, 4)).join("  ");
+    if (this.up) {
+      const held = attitude(quaternion_wxyz, this.up);
+      for (const name of ["heading", "pitch", "roll"]) shown(name).textContent = signed(held[name], 1);
+    }
+    this.#showSpeed(pose, file || source === "photo");
+    data.frame = String((this.#count += 1)); // last: who waits for it finds the rest in place
+  }
+
+  /** Show how far the film's camera is from its true pose, and the median of the run so far. */
+  showError(pose, truth, frame) {
+    if (frame < this.#last) this.#errors = [];
+    this.#last = frame;
+    this.#element.dataset.filmFrame = String(frame);
+    const { mm, deg } = deviation(pose, truth);
+    this.#errors.push({ mm, deg });
+    const [middleMm, middleDeg] = ["mm", "deg"].map((unit) => median(this.#errors.map((error) => error[unit])));
+    const frames = `${this.#errors.length} ${this.#errors.length === 1 ? "frame" : "frames"}`;
+    this.#showErrors(
+      "Error",
+      `${(mm / 1000).toFixed(3)} m`,
+      `${deg.toFixed(1)}°`,
+      `median of ${frames}: ${(middleMm / 1000).toFixed(3)} m, ${middleDeg.toFixed(1)}°`,
+    );
+  }
+
+  /** Show how far a test frame's pose is from the one that PyTorch found. */
+  showDeviation({ mm, deg }, allowed) {
+    const within = mm <= allowed.position_mm && deg <= allowed.rotation_deg;
+    const limits = `allowed ${allowed.position_mm} mm, ${allowed.rotation_deg}°`;
+    this.#showErrors(
+      "From PyTorch",
+      `${small(mm, 3)} mm`,
+      `${small(deg, 3)}°`,
+      `${limits}: ${within ? "reproduced" : "not reproduced"}`,
+      within,
+    );
+  }
+
+  #showErrors(name, position, rotation, detail, within = "") {
+    const row = document.getElementById("errors");
+    row.hidden = false;
+    row.dataset.within = String(within);
+    document.getElementById("errors-name").textContent = name;
+    shown("error-position").textContent = position;
+    shown("error-rotation").textContent = rotation;
+    shown("error-detail").textContent = detail;
+  }
+
+  #showSpeed({ preprocess_ms, network_ms }, single) {
+    const now = performance.now();
+    this.#times = [...this.#times.filter((time) => now - time < RATE_WINDOW_MS), now];
+    this.#latencies = [...this.#latencies.slice(1 - LATENCIES), { preprocess_ms, network_ms }];
+    const [preprocess, network] = ["preprocess_ms", "network_ms"].map((part) =>
+      median(this.#latencies.map((latency) => latency[part])),
+    );
+    const intervals = this.#times.length - 1;
+    const fps = (1000 * intervals) / (now - this.#times[0]);
+    shown("fps").textContent = intervals > 1 && !single ? fps.toFixed(1) : "–";
+    shown("latency").textContent = (preprocess + network).toFixed(1);
+    shown("latency-detail").textContent = `${preprocess.toFixed(1)} + ${network.toFixed(1)}`;
+  }
+}

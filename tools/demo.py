@@ -1,0 +1,41 @@
+"""Localise in a browser: python tools/demo.py [BUNDLE] [--port 8000] [--lan] [--film VIDEO] [--out FOLDER]."""
+
+import argparse
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from mambaloc.console import exits_cleanly, quieten
+from mambaloc.demo import LOOPBACK, build_site, embedded_film, serve
+from mambaloc.demo.lan import lan_address, qr_code, self_signed
+from mambaloc.zoo.bundles import released_bundle
+
+
+@exits_cleanly
+def main() -> None:
+    """Serve the page until Ctrl-C, or write it."""
+    quieten()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("bundle", nargs="?", type=Path, help="of tools/export.py; the embedded room's by default")
+    parser.add_argument("--port", type=int, default=8000, help="0 takes a free one")
+    parser.add_argument("--lan", action="store_true", help="serve the local network by HTTPS, for a phone's camera")
+    parser.add_argument("--film", type=Path, help="video for the page to play")
+    parser.add_argument("--out", type=Path, help="write the page there, for any web server, and end")
+    args = parser.parse_args()
+    bundle = args.bundle or released_bundle()
+    film = args.film or (None if args.bundle else embedded_film())
+    if args.out:
+        print(f"wrote {build_site(bundle, args.out, film)}")
+        return
+    host = lan_address() if args.lan else LOOPBACK
+    tls = self_signed(host) if args.lan else None
+    with TemporaryDirectory() as folder:
+        site = build_site(bundle, Path(folder, "site"), film)
+        with serve(site, args.port, host, tls) as server, suppress(KeyboardInterrupt):
+            url = f"{'https' if tls else 'http'}://{host}:{server.server_port}/"
+            print(f"{qr_code(url) if tls else ''}{url}  (Ctrl-C ends)", flush=True)
+            server.serve_forever()
+
+
+if __name__ == "__main__":
+    main()
