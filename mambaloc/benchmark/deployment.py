@@ -12,6 +12,8 @@ from tempfile import TemporaryDirectory
 import onnx
 import onnxruntime
 import torch
+from rich.console import Console
+from rich.progress import track
 from torch import Tensor
 
 from mambaloc.benchmark.latency import in_turns
@@ -24,6 +26,8 @@ from mambaloc.export.quantisation import eight_bit, median_errors
 from mambaloc.metrics import summarise
 from mambaloc.models import LitPoseRegressor
 
+_A_TURN = 5  # repetitions
+
 
 @dataclass(frozen=True)
 class Deployment:
@@ -31,12 +35,12 @@ class Deployment:
 
     Args:
         name: of the system.
-        form: ``PyTorch``, ``float32``, ``float16`` or ``int8``; the last three on ONNX Runtime.
+        form: ``PyTorch``, ``float32``, ``float16``, ``int8`` or ``int8 mixed``; all but the first on ONNX Runtime.
         size: bytes of its file.
         latency_s: of one image, each repetition.
         position_error_m: median over the test frames.
         rotation_error_deg: likewise.
-        note: what else is to be known of it.
+        fits: whether it loses so little that a bundle may hold it.
     """
 
     name: str
@@ -45,7 +49,7 @@ class Deployment:
     latency_s: list[float]
     position_error_m: float
     rotation_error_deg: float
-    note: str = ""
+    fits: bool = True
 
     @property
     def spread_s(self) -> float:
@@ -59,7 +63,7 @@ class _Form:
     size: int
     call: Callable[[], object]
     errors: Mapping[str, float]
-    note: str = ""
+    fits: bool = True
 
 
 def measure_deployment(
@@ -85,12 +89,12 @@ def measure_deployment(
             for name, (system, data) in systems.items()
             for form, measured in _forms(system.cpu().eval(), data, threads).items()
         }
-        latencies = in_turns([form.call for form in forms.values()], repetitions)
+        latencies = _latencies([form.call for form in forms.values()], repetitions)
     finally:
         torch.set_num_threads(before)
     return [
         Deployment(
-            *names, form.size, taken, form.errors["position_error_m"], form.errors["rotation_error_deg"], form.note
+            *names, form.size, taken, form.errors["position_error_m"], form.errors["rotation_error_deg"], form.fits
         )
         for (names, form), taken in zip(forms.items(), latencies, strict=True)
     ]
@@ -99,6 +103,19 @@ def measure_deployment(
 def speed_up(deployments: Sequence[Deployment], each: Deployment) -> float:
     """How many times faster a form is than the first of them."""
     return median(deployments[0].latency_s) / median(each.latency_s)
+
+
+def _latencies(calls: list[Callable[[], object]], repetitions: int) -> list[list[float]]:
+    """Seconds of each call, in turns of a few, so that all meet the same machine.
+
+    The first of a turn do not count: the threads of whoever was before spin on for a while.
+    """
+    taken: list[list[float]] = [[] for _ in calls]
+    console = Console(stderr=True)
+    for _ in track(range(-(-repetitions // _A_TURN)), "timing", console=console, transient=True):
+        for call, seconds in zip(calls, taken, strict=True):
+            seconds += in_turns([call], _A_TURN)[0]
+    return taken
 
 
 def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict[str, _Form]:
@@ -116,8 +133,8 @@ def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict
     forms["float16"] = _on_onnx_runtime(half, image, threads, median_errors(half, data))
     int8 = eight_bit(exported, data)
     errors = {"position_error_m": int8.position_error_m, "rotation_error_deg": int8.rotation_error_deg}
-    note = int8.kind if int8.fits else f"{int8.kind}, {int8.loss:+.0%}: not shipped"
-    forms["int8"] = _on_onnx_runtime(int8.model, image, threads, errors, note)
+    name = "int8" if int8.kind == "all layers" else f"int8 {int8.kind}"
+    forms[name] = _on_onnx_runtime(int8.model, image, threads, errors, int8.fits)
     return forms
 
 
@@ -130,7 +147,7 @@ def _eager(system: LitPoseRegressor, image: Tensor) -> Callable[[], object]:
 
 
 def _on_onnx_runtime(
-    model: onnx.ModelProto, image: Tensor, threads: int, errors: Mapping[str, float], note: str = ""
+    model: onnx.ModelProto, image: Tensor, threads: int, errors: Mapping[str, float], fits: bool = True
 ) -> _Form:
     content = model.SerializeToString()
     options = onnxruntime.SessionOptions()
@@ -139,4 +156,4 @@ def _on_onnx_runtime(
     options.add_session_config_entry("session.force_spinning_stop", "1")  # else it disturbs whose turn is next
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     feed = {"image": image.numpy()}
-    return _Form(len(content), lambda: session.run(None, feed), errors, note)
+    return _Form(len(content), lambda: session.run(None, feed), errors, fits)

@@ -14,7 +14,10 @@ from mambaloc.benchmark.deployment import Deployment, speed_up
 from mambaloc.benchmark.latency import Latency, forward_flops
 from mambaloc.benchmark.loading import LoadingRates
 from mambaloc.benchmark.sizes import UNEXPLAINED, Size
+from mambaloc.export.quantisation import LARGEST_LOSS
 from mambaloc.models.base import mib
+
+NOT_SHIPPED = f"\n* loses more than {LARGEST_LOSS:.0%} of its median error, so no bundle holds it"
 
 
 def print_sizes(sizes: Sequence[Size]) -> None:
@@ -65,14 +68,17 @@ def print_latencies(latencies: Sequence[Latency], image_size: int, machine: str)
 
 def print_deployments(deployments: Sequence[Deployment], threads: int, machine: str) -> None:
     """Print a row a system and form: size, latency with its spread, how much faster than the first row, errors."""
-    title = f"One image at a time, {threads} threads, {machine}; errors: medians over the test frames"
-    table = _table(title, "system", "form", "MiB", "ms", "± IQR", "faster", "median m", "median °", "note")
+    table = _table("Trained systems on a device", "system", "form", "MiB", "ms", "± IQR", "faster", "m", "°")
     for each in deployments:
         times = (f"{1000 * s:.2f}" for s in (median(each.latency_s), each.spread_s))
         errors = (f"{each.position_error_m:.3f}", f"{each.rotation_error_deg:.2f}")
         ratio = f"{speed_up(deployments, each):.1f}x"
-        table.add_row(_run(each.name), each.form, f"{each.size / 2**20:.2f}", *times, ratio, *errors, each.note)
-    Console(highlight=False).print(table)
+        form = each.form if each.fits else f"{each.form}*"
+        table.add_row(_run(each.name), form, f"{each.size / 2**20:.2f}", *times, ratio, *errors)
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(f"One image at a time, {threads} threads; errors: medians over the test frames.", soft_wrap=True)
+    console.print(f"{machine}{'' if all(each.fits for each in deployments) else NOT_SHIPPED}", soft_wrap=True)
 
 
 def _run(source: str) -> str:
@@ -91,6 +97,6 @@ def print_loading(rates: LoadingRates, machine: str) -> None:
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for column in columns:
-        text = column in ("system", "gis", "what", "form", "note")
+        text = column in ("system", "gis", "what", "form")
         table.add_column(column, justify="left" if text else "right", no_wrap=True)
     return table

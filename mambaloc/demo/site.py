@@ -47,8 +47,7 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
         for name in _listed(bundle):
             (site / "bundle" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(bundle / name, site / "bundle" / name)
-        if film is not None:
-            _add_film(site, film)
+        _add_film(site, film)
     return out
 
 
@@ -85,7 +84,10 @@ def _listed(bundle: Path) -> list[str]:
     return [CONTRACT_FILE, *contract["files"]]
 
 
-def _add_film(site: Path, film: Path) -> None:
+def _add_film(site: Path, film: Path | None) -> None:
+    if film is None:
+        (site / POSES_FILE).write_text("null\n", encoding="utf-8")  # there is none
+        return
     try:
         if film.is_dir():
             shutil.copytree(film, site, dirs_exist_ok=True)

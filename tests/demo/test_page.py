@@ -1,0 +1,139 @@
+"""The page in a real browser finds what Python finds."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from conftest import served
+
+from mambaloc.demo import build_site
+from mambaloc.runtime import Localiser
+from mambaloc.runtime.bundle import rotation_deg
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def address(site):
+    with served(site) as server:
+        yield f"http://127.0.0.1:{server.server_port}/"
+
+
+@pytest.fixture
+def opened(browser, address):
+    """Opens the page at a source; its console holds no error when the test ends."""
+    context = browser.new_context()
+    mistakes = []
+
+    def open_(source, where=address):
+        page = context.new_page()
+        page.on("pageerror", lambda error: mistakes.append(str(error)))
+        page.on("console", lambda message: mistakes.append(message.text) if message.type == "error" else None)
+        page.goto(f"{where}?source={source}&backend=wasm")
+        page.wait_for_selector("body:not([data-state=loading])", timeout=60_000)
+        return page
+
+    yield open_
+    context.close()
+    assert not mistakes
+
+
+def pose_of(page, count=1):
+    """What the page says after so many localisations."""
+    page.wait_for_selector(f'#pose[data-frame="{count}"]', timeout=30_000)
+    read = [json.loads(page.get_attribute("#pose", f"data-{name}")) for name in ("position-m", "quaternion-wxyz")]
+    return tuple(np.array(each) for each in read)
+
+
+def check(found, expected, mm=1.0, deg=0.1):
+    position_m, quaternion = found
+    assert 1000 * np.linalg.norm(position_m - expected.position_m) < mm
+    assert rotation_deg(quaternion, expected.quaternion) < deg
+
+
+def test_poses_of_the_frames_are_pythons(opened, bundle):
+    page, localiser = opened("frames"), Localiser(bundle)
+    frames = json.loads((bundle / "contract.json").read_text())["frames"]
+    for count, frame in enumerate(frames, start=1):
+        page.click(f'[data-frame-file="{frame["file"]}"]')
+        check(pose_of(page, count), localiser.localise(bundle / frame["file"]))
+    assert page.get_attribute("body", "data-backend") == "wasm"
+    assert page.evaluate(expression="crossOriginIsolated") is True
+
+
+def test_a_bundle_that_takes_pictures_as_they_are(opened, raw_bundle, tmp_path):
+    with served(build_site(raw_bundle, tmp_path / "site")) as server:
+        page = opened("frames", f"http://127.0.0.1:{server.server_port}/")
+        page.click('[data-frame-file="frames/1.png"]')
+        check(pose_of(page), Localiser(raw_bundle).localise(raw_bundle / "frames/1.png"))
+
+
+def test_the_page_checks_the_bundle_by_itself(opened):
+    page = opened("frames")
+    page.click("#check")
+    page.wait_for_selector("#verdict:has-text('Yes')", timeout=30_000)
+
+
+@pytest.mark.parametrize("kind", ["colour", "grey", "turned"])
+def test_photos_are_localised(opened, bundle, tmp_path, kind):
+    page = opened("photo")
+    picture = cv2.imread(str(bundle / "frames/3.png"))
+    path = tmp_path / "photo.png"
+    if kind == "turned":  # lying on its side, and its EXIF says so
+        path = tmp_path / "photo.jpg"
+        on_its_side = cv2.rotate(picture, cv2.ROTATE_90_COUNTERCLOCKWISE)
+        jpeg = bytes(cv2.imencode(".jpg", on_its_side, [cv2.IMWRITE_JPEG_QUALITY, 100])[1])
+        exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
+        path.write_bytes(jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:])
+    else:
+        cv2.imwrite(str(path), picture[..., 1] if kind == "grey" else picture)
+    page.set_input_files("#photo", path)
+    lossy = {"mm": 10.0, "deg": 0.5} if kind == "turned" else {}  # no two decoders agree on a JPEG
+    check(pose_of(page), Localiser(bundle).localise(path), **lossy)
+
+
+def test_the_film_runs_beside_its_true_poses(opened, bundle, film):
+    page, localiser = opened("film"), Localiser(bundle)
+    page.wait_for_selector("body[data-state=running]", timeout=30_000)
+    page.wait_for_selector("#pose[data-film-frame]", timeout=30_000)
+    page.click("#play")  # which pauses
+    page.wait_for_selector("body[data-state=ready]", timeout=30_000)
+    number = int(page.get_attribute("#pose", "data-film-frame"))
+    capture = cv2.VideoCapture(str(film / "film.webm"))
+    pictures = [capture.read()[1] for _ in range(number + 1)]
+    found = np.array(json.loads(page.get_attribute("#pose", "data-position-m")))
+    assert np.linalg.norm(found - localiser.localise(pictures[number][..., ::-1].copy()).position_m) < 0.1
+    assert "m" in page.inner_text("[data-show=error-position]")
+
+
+def test_a_camera_is_localised(opened):
+    page = opened("camera")
+    page.wait_for_selector("body[data-state=running]", timeout=30_000)
+    assert page.get_attribute("#pose", "data-source") == "camera"
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"), [((120, 60, 3), "too narrow"), (None, "no picture that this browser can read")]
+)
+def test_a_picture_that_cannot_be_localised_is_one_clear_line(opened, tmp_path, shape, message):
+    page, path = opened("photo"), tmp_path / "photo.png"
+    path.write_bytes(b"noise" if shape is None else cv2.imencode(".png", np.zeros(shape, np.uint8))[1].tobytes())
+    page.set_input_files("#photo", path)
+    page.wait_for_selector("body[data-state=error]", timeout=30_000)
+    assert message in page.inner_text("#error")
+
+
+def test_a_changed_model_is_refused(browser, site, tmp_path):
+    changed = shutil.copytree(site, tmp_path / "site")
+    model = changed / "bundle/model.onnx"
+    content = bytearray(model.read_bytes())
+    content[len(content) // 2] ^= 1
+    model.write_bytes(content)
+    with served(changed) as server:
+        page = browser.new_page()
+        page.goto(f"http://127.0.0.1:{server.server_port}/?backend=wasm")
+        page.wait_for_selector("body[data-state=error]", timeout=60_000)
+        assert "is not the file that its contract was written with" in page.inner_text("#error")
+        page.close()
