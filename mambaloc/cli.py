@@ -201,3 +201,6 @@ def main(argv: list[str] | None = None) -> RecipeCLI:
 
 
 __all__ = ["LitDistillation", "RecipeCLI", "main", "recipe_arguments"]
+
+if __name__ == "__main__":
+    main()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import ipaddress
 import os
 import socket
@@ -77,8 +78,6 @@ def qr_code(text: str) -> str:
         import segno
     except ImportError:
         raise InputError("--lan: needs the package segno; pip install 'mambaloc[lan]'") from None
-    import io
-
     out = io.StringIO()
     segno.make(text, error="l").terminal(out, compact=True)
     return out.getvalue()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 
-from mambaloc import __version__
 from mambaloc.data import PoseDataModule
 from mambaloc.data.cache import default_cache_dir
 from mambaloc.evaluation.evaluate import data_of
@@ -46,7 +46,7 @@ def released_bundle(name: str = EMBEDDED) -> Path:
         InputError: where there is no such model, or its scene's frames are not there.
     """
     digest = Manifest.read(released_folder(name)).weights_sha256[:12]
-    folder = default_cache_dir() / "bundles" / f"{name.rpartition('/')[2]}-{digest}-{__version__}"
+    folder = default_cache_dir() / "bundles" / f"{name.rpartition('/')[2]}-{digest}-{version('mambaloc')}"
 
     def make(partial: Path) -> None:
         write_bundle(*load_with_data(name), partial / "bundle", ("onnx",), target="pc")
