@@ -19,6 +19,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--out", type=Path, help="folder of the result; beside the checkpoint unless given")
     parser.add_argument("--accelerator", default="auto", help="as Lightning's Trainer takes it")
+    parser.add_argument(
+        "--retrieval", action="store_true", help="also measure retrieval on the backbone's first features"
+    )
     parser.add_class_arguments(PoseDataModule, "data")
     checkpoint = parser.parse_args(argv, defaults=False).checkpoint
     if checkpoint is None:
@@ -28,7 +31,8 @@ def main(argv: list[str] | None = None) -> None:
     )
     args = parser.parse_args(argv)
     out = args.out or checkpoint.parent.parent / "evaluation" / checkpoint.stem
-    print_table([evaluate_checkpoint(checkpoint, out, PoseDataModule(**args.data), args.accelerator)])
+    data = PoseDataModule(**args.data)
+    print_table([evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval)])
     print(f"{out}: metrics.json, predictions.csv, predictions.tum, trajectory.png")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,24 @@ import lightning as L
 from mambaloc import provenance
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation.references import median_training_pose
+from mambaloc.evaluation.intervals import BLOCK, LEVEL, block_resamples, median_interval
+from mambaloc.evaluation.references import frozen_features, median_training_pose, nearest_training_pose, retrieval
 from mambaloc.evaluation.trajectories import write_csv
 from mambaloc.files import sha256
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models import LitPoseRegressor, load_checkpoint
 from mambaloc.models.base import mib, parameter_count, read_checkpoint
+from mambaloc.nn import PooledBackbone
 from mambaloc.runtime.trajectory import write_tum
 from mambaloc.viz import draw_trajectory
 
 
 def evaluate_checkpoint(
-    checkpoint: Path, out: Path, data: PoseDataModule | None = None, accelerator: str = "auto"
+    checkpoint: Path,
+    out: Path,
+    data: PoseDataModule | None = None,
+    accelerator: str = "auto",
+    with_retrieval: bool = False,
 ) -> dict[str, Any]:
     """Localise every test frame with a checkpoint and write the result to a folder.
 
@@ -35,6 +42,7 @@ def evaluate_checkpoint(
         out: the folder to write to.
         data: the frames; those of the training recipe unless given.
         accelerator: as Lightning's Trainer takes it.
+        with_retrieval: also measure retrieval on the features that the backbone starts with.
 
     Returns:
         What ``metrics.json`` holds.
@@ -54,7 +62,8 @@ def evaluate_checkpoint(
         "count": len(table.index),
         "data": data.describe(),
         "split": "test",
-        "references": _references(data, table),
+        "intervals": _intervals(table, data.frames("test").sequences),
+        "references": {**_references(data, table), **(_retrieval(stored, data, table) if with_retrieval else {})},
         "selection": selection_rule(stored, checkpoint),
         "model": _describe_model(system),
         "training": _describe_training(stored, checkpoint),
@@ -115,9 +124,28 @@ def _validates_on_test(stored: dict[str, Any]) -> bool:
 
 def _references(data: PoseDataModule, table: PoseErrorTable) -> dict[str, dict[str, float]]:
     try:
-        return {"median_training_pose": median_training_pose(data.listed_training_frames(), table)}
+        train = data.listed_training_frames()
     except InputError:  # a test split alone can be measured too
         return {}
+    references = (median_training_pose, nearest_training_pose)
+    return {reference.__name__: reference(train, table) for reference in references}
+
+
+def _retrieval(stored: dict[str, Any], data: PoseDataModule, table: PoseErrorTable) -> dict[str, dict[str, float]]:
+    told = stored["hyper_parameters"]
+    if not told.get("backbone_weights"):
+        raise InputError("--retrieval: this backbone started from scratch; such features find nothing, leave it out")
+    names = ("backbone", "backbone_weights", "backbone_args", "pixel_mean", "pixel_std")
+    data.setup("fit")
+    features = frozen_features(PooledBackbone(*(told[name] for name in names)), data)
+    return retrieval(data.frames("train"), *features, table)
+
+
+def _intervals(table: PoseErrorTable, sequences: Sequence[str]) -> dict[str, Any]:
+    rows = block_resamples([sequences[i] for i in table.index.tolist()])
+    errors = {"position_error_m": table.position_error_m, "rotation_error_deg": table.rotation_error_deg}
+    medians = {name: list(median_interval(each.cpu().double().numpy(), rows)) for name, each in errors.items()}
+    return {"level": LEVEL, "block_frames": BLOCK, **medians}
 
 
 def _describe_model(system: LitPoseRegressor) -> dict[str, Any]:
