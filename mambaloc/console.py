@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import sys
 import warnings
@@ -11,6 +12,8 @@ from typing import Any
 
 from mambaloc.errors import InputError
 
+_MOST_THREADS = 256
+
 
 def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
     """Make a tool's ``main`` print an :class:`InputError` as one line on stderr and exit with code 2."""
@@ -19,6 +22,9 @@ def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
             return main(*args, **kwargs)
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            raise SystemExit(130) from None
         except Exception as error:
             if mistake := _user_mistake(error):
                 print(f"error: {mistake}", file=sys.stderr)
@@ -33,6 +39,13 @@ def _user_mistake(error: BaseException | None) -> InputError | None:
     while error is not None and not isinstance(error, InputError):
         error = error.__cause__ or error.__context__
     return error
+
+
+def thread_count(text: str) -> int:
+    """Read an option's number of threads, for :mod:`argparse`."""
+    if not text.isdecimal() or not 1 <= int(text) <= _MOST_THREADS:
+        raise argparse.ArgumentTypeError(f"{text}: give a number of threads from 1 to {_MOST_THREADS}")
+    return int(text)
 
 
 def quieten() -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-from filelock import FileLock
 
 from mambaloc.errors import InputError
 
@@ -28,39 +27,19 @@ def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
         remedy: what the user may do where it cannot be written.
 
     Raises:
-        InputError: where it cannot be written.
+        InputError: where it cannot be written, or is there by then, or the block cannot read a file.
     """
-    partial = folder.with_name(f".{folder.name}.partial")
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        yield partial
-        partial.replace(folder)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); {remedy}") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def made_once(folder: Path, make: Callable[[Path], object]) -> Path:
-    """A folder of the user's cache: made by who comes first, while others wait, and found again by all.
-
-    Args:
-        folder: its name.
-        make: fills an empty folder, which gets its name once this ends; an error leaves nothing.
-
-    Raises:
-        InputError: where it cannot be written.
-    """
-    remedy = "set MAMBALOC_CACHE to a folder that can"
-    if folder.is_dir():
-        return folder
+    partial = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder.with_name(f"{folder.name}.lock")):
-            if not folder.is_dir():  # another process may have made it meanwhile
-                with whole_folder(folder, remedy) as partial:
-                    make(partial)
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))  # nobody else's
+        yield partial
+        partial.chmod(0o755)  # a temporary folder is its owner's alone
+        partial.replace(folder)
     except OSError as error:
-        raise InputError(f"{folder.parent}: cannot be written ({error.strerror}); {remedy}") from None
-    return folder
+        file = Path(error.filename) if isinstance(error.filename, str) else folder
+        where = folder if partial is not None and file.is_relative_to(partial) else file
+        raise InputError(f"{where}: {error.strerror or error}; {remedy}") from None
+    finally:
+        if partial is not None:
+            shutil.rmtree(partial, ignore_errors=True)

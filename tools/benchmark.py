@@ -3,7 +3,7 @@
 import argparse
 
 from mambaloc import benchmark, list_models, provenance
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import exits_cleanly, quieten, thread_count
 from mambaloc.data import PoseDataModule
 from mambaloc.models.registry import model_class
 from mambaloc.zoo.bundles import load_with_data
@@ -25,7 +25,7 @@ def main() -> None:
     deployment.add_argument(
         "sources", nargs="+", help="checkpoints or zoo names; the first is what others are faster than"
     )
-    deployment.add_argument("--threads", type=int, default=2)
+    deployment.add_argument("--threads", type=thread_count, default=2)
     deployment.add_argument("--repetitions", type=int, default=50)
     loading = what.add_parser("loading", help="images per second from the cache and decoding every epoch")
     for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):

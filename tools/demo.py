@@ -1,13 +1,10 @@
 """Localise in a browser: python tools/demo.py [BUNDLE] [--port 8000] [--lan] [--film VIDEO] [--out FOLDER]."""
 
 import argparse
-from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from mambaloc.console import exits_cleanly, quieten
-from mambaloc.demo import LOOPBACK, build_site, embedded_film, serve
-from mambaloc.demo.lan import lan_address, qr_code, self_signed
+from mambaloc.demo import build_site, embedded_film, serve_page
 from mambaloc.zoo.bundles import released_bundle
 
 
@@ -26,15 +23,8 @@ def main() -> None:
     film = args.film or (None if args.bundle else embedded_film())
     if args.out:
         print(f"wrote {build_site(bundle, args.out, film)}")
-        return
-    host = lan_address() if args.lan else LOOPBACK
-    tls = self_signed(host) if args.lan else None
-    with TemporaryDirectory() as folder:
-        site = build_site(bundle, Path(folder, "site"), film)
-        with serve(site, args.port, host, tls) as server, suppress(KeyboardInterrupt):
-            url = f"{'https' if tls else 'http'}://{host}:{server.server_port}/"
-            print(f"{qr_code(url) if tls else ''}{url}  (Ctrl-C ends)", flush=True)
-            server.serve_forever()
+    else:
+        serve_page(bundle, film, args.port, args.lan)
 
 
 if __name__ == "__main__":

@@ -22,9 +22,9 @@ def main() -> None:
     parser.add_argument("--root", help="folder that holds the scene; as in training unless given")
     parser.add_argument("--out", type=Path, help="folder of the bundle; RUN/bundle or bundles/ZOO_NAME unless given")
     args = parser.parse_args()
-    formats = tuple(dict.fromkeys(args.to.split(",")))
-    if unknown := set(formats) - set(FORMATS):
-        raise InputError(f"--to {args.to}: {', '.join(sorted(unknown))} is none of {', '.join(FORMATS)}")
+    formats = tuple(dict.fromkeys(word.strip() for word in args.to.split(",")))
+    if unknown := sorted(map(repr, set(formats) - set(FORMATS))):
+        raise InputError(f"--to {args.to}: {', '.join(unknown)} is none of {', '.join(FORMATS)}")
     system, data = load_with_data(args.source, args.root)
     is_run = Path(args.source).is_file()
     out = args.out or (

@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly
-from mambaloc.runtime import Localiser, write_tum
+from mambaloc.console import exits_cleanly, thread_count
+from mambaloc.runtime import Localiser
+from mambaloc.runtime.report import follow
 
 
 @exits_cleanly
@@ -16,21 +17,19 @@ def main() -> None:
     )
     parser.add_argument("source", help="a video, a picture, a folder of pictures, or a camera's number")
     parser.add_argument("--out", type=Path, default=Path("poses.tum"), help="trajectory to write, TUM format")
-    parser.add_argument("--threads", type=int, help="that one image may use")
+    parser.add_argument("--threads", type=thread_count, help="that one image may use")
     args = parser.parse_args()
     localiser = Localiser(_model(args.model), args.threads)
-    found = localiser.localise_each(args.source)
-    write_tum(args.out, found.time_s, found.position_m, found.quaternion)
-    latency_ms = f"{1000 * found.median_latency_s:.1f} ms a frame"
-    print(f"{args.out}: {len(found.time_s)} poses in {localiser.contract.scene}, median {latency_ms}")
+    count, latency_ms = follow(localiser, args.source, args.out)
+    print(f"{args.out}: {count} poses in {localiser.contract.scene}, median {latency_ms:.1f} ms a frame")
 
 
 def _model(name: str | None) -> Path:
-    if name and (Path(name).exists() or Path(name).suffix in (".onnx", ".ort")):
+    if name is not None and (Path(name).exists() or Path(name).suffix in (".onnx", ".ort")):
         return Path(name)
     from mambaloc.zoo.bundles import EMBEDDED, released_bundle  # needs torch, which an exported model does not
 
-    return released_bundle(name or EMBEDDED)
+    return released_bundle(EMBEDDED if name is None else name)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly
+from mambaloc.console import exits_cleanly, thread_count
 from mambaloc.errors import InputError
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.report import print_deviations
@@ -14,7 +14,7 @@ def main() -> None:
     """Print each model's deviation; exit with code 2 where one is larger than the bundle allows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("bundle", type=Path)
-    parser.add_argument("--threads", type=int, help="that one image may use")
+    parser.add_argument("--threads", type=thread_count, help="that one image may use")
     args = parser.parse_args()
     deviations = verify_bundle(args.bundle, args.threads)
     print_deviations(deviations)

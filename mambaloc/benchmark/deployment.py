@@ -40,6 +40,7 @@ class Deployment:
         latency_s: of one image, each repetition.
         position_error_m: median over the test frames.
         rotation_error_deg: likewise.
+        frames: that these are over.
         fits: whether it loses so little that a bundle may hold it.
     """
 
@@ -49,6 +50,7 @@ class Deployment:
     latency_s: list[float]
     position_error_m: float
     rotation_error_deg: float
+    frames: int
     fits: bool = True
 
     @property
@@ -62,7 +64,7 @@ class Deployment:
 class _Form:
     size: int
     call: Callable[[], object]
-    errors: Mapping[str, float]
+    errors: tuple[float, float]  # metres, degrees
     fits: bool = True
 
 
@@ -92,21 +94,22 @@ def measure_deployment(
         latencies = _latencies([form.call for form in forms.values()], repetitions)
     finally:
         torch.set_num_threads(before)
+    counts = {name: len(data.frames("test")) for name, (_, data) in systems.items()}
     return [
-        Deployment(
-            *names, form.size, taken, form.errors["position_error_m"], form.errors["rotation_error_deg"], form.fits
-        )
-        for (names, form), taken in zip(forms.items(), latencies, strict=True)
+        Deployment(name, form, of.size, taken, *of.errors, counts[name], of.fits)
+        for ((name, form), of), taken in zip(forms.items(), latencies, strict=True)
     ]
 
 
-def speed_up(deployments: Sequence[Deployment], each: Deployment) -> float:
-    """How many times faster a form is than the first of them."""
-    return median(deployments[0].latency_s) / median(each.latency_s)
+def speed_up(deployments: Sequence[Deployment], each: Deployment) -> tuple[float, float]:
+    """How many times faster a form is than the first of them: ratio of the medians, quartile range of the turns'."""
+    first = deployments[0].latency_s
+    low, _, high = quantiles([a / b for a, b in zip(first, each.latency_s, strict=True)], n=4)
+    return median(first) / median(each.latency_s), high - low
 
 
 def _latencies(calls: list[Callable[[], object]], repetitions: int) -> list[list[float]]:
-    """Seconds of each call, in turns of a few, so that all meet the same machine.
+    """Seconds of each call, in turns of a few back to back, so that all meet the same machine.
 
     The first of a turn do not count: the threads of whoever was before spin on for a while.
     """
@@ -125,17 +128,20 @@ def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict
         exported = onnx.load(Path(folder, "model.onnx"))
     weights = io.BytesIO()
     torch.save(system.network.state_dict(), weights)
-    forms = {
-        "PyTorch": _Form(weights.tell(), _eager(system, image), summarise(localise_test_frames(system, data, "cpu"))),
-        "float32": _on_onnx_runtime(exported, image, threads, median_errors(exported, data)),
+    half, int8 = half_precision(exported), eight_bit(exported, data)
+    said = summarise(localise_test_frames(system, data, "cpu"))
+    return {
+        "PyTorch": _Form(weights.tell(), _eager(system, image), _medians(said)),
+        "float32": _on_onnx_runtime(exported, image, threads, _medians(median_errors(exported, data))),
+        "float16": _on_onnx_runtime(half, image, threads, _medians(median_errors(half, data))),
+        "int8" if int8.kind == "all layers" else f"int8 {int8.kind}": _on_onnx_runtime(
+            int8.model, image, threads, (int8.position_error_m, int8.rotation_error_deg), int8.fits
+        ),
     }
-    half = half_precision(onnx.ModelProto.FromString(exported.SerializeToString()))
-    forms["float16"] = _on_onnx_runtime(half, image, threads, median_errors(half, data))
-    int8 = eight_bit(exported, data)
-    errors = {"position_error_m": int8.position_error_m, "rotation_error_deg": int8.rotation_error_deg}
-    name = "int8" if int8.kind == "all layers" else f"int8 {int8.kind}"
-    forms[name] = _on_onnx_runtime(int8.model, image, threads, errors, int8.fits)
-    return forms
+
+
+def _medians(errors: Mapping[str, float]) -> tuple[float, float]:
+    return errors["position_error_m"], errors["rotation_error_deg"]
 
 
 def _eager(system: LitPoseRegressor, image: Tensor) -> Callable[[], object]:
@@ -147,7 +153,7 @@ def _eager(system: LitPoseRegressor, image: Tensor) -> Callable[[], object]:
 
 
 def _on_onnx_runtime(
-    model: onnx.ModelProto, image: Tensor, threads: int, errors: Mapping[str, float], fits: bool = True
+    model: onnx.ModelProto, image: Tensor, threads: int, errors: tuple[float, float], fits: bool = True
 ) -> _Form:
     content = model.SerializeToString()
     options = onnxruntime.SessionOptions()

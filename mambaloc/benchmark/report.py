@@ -10,6 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from mambaloc import provenance
 from mambaloc.benchmark.deployment import Deployment, speed_up
 from mambaloc.benchmark.latency import Latency, forward_flops
 from mambaloc.benchmark.loading import LoadingRates
@@ -68,16 +69,21 @@ def print_latencies(latencies: Sequence[Latency], image_size: int, machine: str)
 
 def print_deployments(deployments: Sequence[Deployment], threads: int, machine: str) -> None:
     """Print a row a system and form: size, latency with its spread, how much faster than the first row, errors."""
-    table = _table("Trained systems on a device", "system", "form", "MiB", "ms", "± IQR", "faster", "m", "°")
+    table = _table("Trained systems on a device", "system", "form", "MiB", "ms", "± IQR", "times faster", "m", "°")
     for each in deployments:
         times = (f"{1000 * s:.2f}" for s in (median(each.latency_s), each.spread_s))
         errors = (f"{each.position_error_m:.3f}", f"{each.rotation_error_deg:.2f}")
-        ratio = f"{speed_up(deployments, each):.1f}x"
+        ratio = "{:.1f} ± {:.1f}".format(*speed_up(deployments, each))
         form = each.form if each.fits else f"{each.form}*"
         table.add_row(_run(each.name), form, f"{each.size / 2**20:.2f}", *times, ratio, *errors)
     console = Console(highlight=False)
     console.print(table)
-    console.print(f"One image at a time, {threads} threads; errors: medians over the test frames.", soft_wrap=True)
+    count, versions = len(deployments[0].latency_s), provenance.versions()
+    packages = ", ".join(f"{name} {versions[name]}" for name in ("torch", "onnxruntime"))
+    console.print(
+        f"{threads} threads, {count} times, one image after another: medians ± quartile range", soft_wrap=True
+    )
+    console.print(f"m and °: medians over {deployments[0].frames} test frames; {packages}", soft_wrap=True)
     console.print(f"{machine}{'' if all(each.fits for each in deployments) else NOT_SHIPPED}", soft_wrap=True)
 
 

@@ -25,6 +25,7 @@ from rich.progress import track
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
 from mambaloc.images import END_BYTES, decode_image, resized
+from mambaloc.user_cache import default_cache_dir
 
 _VERSION = 1
 
@@ -40,13 +41,6 @@ class FrameCache:
 
     images: NDArray[np.uint8]
     rows: NDArray[np.int64]
-
-
-def default_cache_dir() -> Path:
-    """``$MAMBALOC_CACHE``, or ``mambaloc`` in the user's cache folder."""
-    if "MAMBALOC_CACHE" in os.environ:
-        return Path(os.environ["MAMBALOC_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mambaloc"
 
 
 def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_dir: Path | None = None) -> FrameCache:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mambaloc.data import cambridge, seven_scenes
-from mambaloc.data.cache import default_cache_dir
 from mambaloc.data.download.origins import how_to_get
 from mambaloc.data.frames import BadFrames, Frames, Split
 from mambaloc.errors import InputError
+from mambaloc.user_cache import default_cache_dir
 
 
 @dataclass(frozen=True)

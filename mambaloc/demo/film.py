@@ -13,11 +13,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from mambaloc.data.cache import default_cache_dir
 from mambaloc.data.rendering import GENERATOR_VERSION, default_intrinsics, embedded_room, embedded_walk, render, sensor
 from mambaloc.data.rendering.poses import quaternion_from_matrix
 from mambaloc.errors import InputError
-from mambaloc.files import made_once
+from mambaloc.user_cache import made_once
 
 FILM_FILE, POSES_FILE = "film.webm", "film.json"
 _FRAMES, _FPS, _SEED = 240, 15, 7
@@ -32,13 +31,13 @@ def embedded_film() -> Path:
     Raises:
         InputError: where the cache cannot be written, or OpenCV came without VP8.
     """
-    return made_once(default_cache_dir() / "films" / f"embedded-{GENERATOR_VERSION}", _take)
+    return made_once(f"films/embedded-{GENERATOR_VERSION}", _take)
 
 
 def _take(folder: Path) -> None:
     room, intrinsics, rng = embedded_room(), default_intrinsics(_SIZE), np.random.default_rng(_SEED)
     walk = embedded_walk(_FRAMES, _SEED, start_deg=135.0, step_deg=1.2)
-    # VP8: every browser plays it, and OpenCV's wheels hold its encoder.
+    # VP8: nearly every browser plays it, and OpenCV's wheels hold its encoder.
     with _quiet():
         writer = cv2.VideoWriter(str(folder / FILM_FILE), cv2.VideoWriter.fourcc(*"VP80"), _FPS, _SIZE)
     if not writer.isOpened():
@@ -47,6 +46,8 @@ def _take(folder: Path) -> None:
         rgb, _ = render(room, intrinsics, world_from_cam, _SIZE)
         writer.write(cv2.cvtColor(sensor(rgb, rng), cv2.COLOR_RGB2BGR))
     writer.release()
+    if (taken := int(cv2.VideoCapture(str(folder / FILM_FILE)).get(cv2.CAP_PROP_FRAME_COUNT))) != _FRAMES:
+        raise InputError(f"{folder.parent}: took {taken} of {_FRAMES} frames of a film; is the disk full?")
     poses = [[*pose[:3, 3], *quaternion_from_matrix(pose[:3, :3])] for pose in walk]
     told = {"file": FILM_FILE, "fps": _FPS, "poses": np.round(poses, 5).tolist()}
     (folder / POSES_FILE).write_text(json.dumps(told) + "\n", encoding="utf-8")

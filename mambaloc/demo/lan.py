@@ -8,6 +8,7 @@ import os
 import socket
 import ssl
 from datetime import UTC, datetime, timedelta
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -36,12 +37,11 @@ def self_signed(address: str) -> ssl.SSLContext:
     Raises:
         InputError: without the extra ``lan``.
     """
-    try:
-        from cryptography import x509
-        from cryptography.hazmat.primitives import hashes, serialization
-        from cryptography.hazmat.primitives.asymmetric import ec
-    except ImportError:
-        raise InputError("--lan: needs the package cryptography; pip install 'mambaloc[lan]'") from None
+    _need("cryptography")
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "MambaLoc demo")])
     now = datetime.now(UTC)
@@ -74,10 +74,16 @@ def qr_code(text: str) -> str:
     Raises:
         InputError: without the extra ``lan``.
     """
-    try:
-        import segno
-    except ImportError:
-        raise InputError("--lan: needs the package segno; pip install 'mambaloc[lan]'") from None
+    _need("segno")
+    import segno
+
     out = io.StringIO()
     segno.make(text, error="l").terminal(out, compact=True)
     return out.getvalue()
+
+
+def _need(package: str) -> None:
+    try:
+        import_module(package)
+    except ImportError:
+        raise InputError(f"--lan: needs the package {package}; pip install 'mambaloc[lan]'") from None

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import re
+import signal
 import ssl
+import sys
+from contextlib import suppress
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from socketserver import TCPServer
+from tempfile import TemporaryDirectory
 from typing import Any
 
+from mambaloc.demo.lan import lan_address, qr_code, self_signed
+from mambaloc.demo.site import build_site
 from mambaloc.errors import InputError
 
 LOOPBACK = "127.0.0.1"
@@ -23,6 +31,31 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",
 }
+
+
+def serve_page(bundle: Path, film: Path | None, port: int, lan: bool) -> None:
+    """Build the page of a bundle, say where it is, and serve it until Ctrl-C or the process is asked to end.
+
+    Args:
+        bundle: as :func:`~mambaloc.demo.site.build_site` takes it.
+        film: likewise.
+        port: as :func:`serve` takes it.
+        lan: serve the local network by HTTPS, and print the address as a code to scan, too.
+
+    Raises:
+        InputError: as :func:`~mambaloc.demo.site.build_site` and :func:`serve`; no network; no extra ``lan``.
+    """
+    host = lan_address() if lan else LOOPBACK
+    tls = self_signed(host) if lan else None
+    code = qr_code if lan else (lambda _: "")
+    code("")  # so that a package that is not there is told before the page is built
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # as Ctrl-C does, leave nothing behind
+    with TemporaryDirectory() as folder:
+        site = build_site(bundle, Path(folder, "site"), film)
+        with serve(site, port, host, tls) as server, suppress(KeyboardInterrupt):
+            url = f"{'https' if tls else 'http'}://{host}:{server.server_port}/"
+            print(f"{code(url)}{url}  (Ctrl-C ends)", flush=True)
+            server.serve_forever()
 
 
 def serve(site: Path, port: int, host: str = LOOPBACK, tls: ssl.SSLContext | None = None) -> ThreadingHTTPServer:
@@ -63,6 +96,13 @@ def _content_policy(page: str) -> str:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = 128
+    allow_reuse_address = os.name != "nt"  # where it would let two servers share a port
+
+    def server_bind(self) -> None:
+        """Bind without asking the network for this machine's name, as the base does: that can take seconds."""
+        TCPServer.server_bind(self)
+        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Keep quiet of browsers that hang up, or do not trust the certificate yet."""
@@ -82,6 +122,17 @@ class _Handler(SimpleHTTPRequestHandler):
         for name, value in {**_HEADERS, "Content-Security-Policy": self.policy}.items():
             self.send_header(name, value)
         super().end_headers()
+
+    def send_head(self) -> Any:
+        """Answer only who asked for this machine: no other site's name leads here. And only of the folder."""
+        host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+        if host not in (self.server.server_name, "localhost"):  # type: ignore[attr-defined]
+            self.send_error(403)
+            return None
+        if not Path(self.translate_path(self.path)).resolve().is_relative_to(Path(self.directory).resolve()):
+            self.send_error(404)
+            return None
+        return super().send_head()
 
     def list_directory(self, path: Any) -> None:
         """Show no folder's listing."""

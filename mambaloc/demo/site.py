@@ -10,13 +10,14 @@ from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 
+import cv2
 from rich.console import Console
 
-from mambaloc.data.cache import default_cache_dir
-from mambaloc.demo.film import POSES_FILE
+from mambaloc.demo.film import FILM_FILE, POSES_FILE
 from mambaloc.errors import InputError
-from mambaloc.files import made_once, whole_folder
+from mambaloc.files import whole_folder
 from mambaloc.runtime.bundle import CONTRACT_FILE, verify_bundle
+from mambaloc.user_cache import made_once
 
 _WEB = files("mambaloc.demo") / "web"
 _VENDORED = "vendor.json"  # the site's files that come from npm, and where they lie in node_modules
@@ -29,7 +30,7 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
     Args:
         bundle: which :func:`~mambaloc.runtime.bundle.verify_bundle` finds as it was written.
         out: the folder, which must not be there yet.
-        film: a video for the page to play, or a folder of one with its true poses; see :func:`embedded_film`.
+        film: a video for the page to play, or what :func:`embedded_film` gives.
 
     Raises:
         InputError: for a bundle or film that is none, a folder that cannot be written, or without Node.js's npm.
@@ -62,7 +63,7 @@ def node_modules(dev: bool = False) -> Path:
     """
     lock = (_WEB / "package-lock.json").read_bytes()
     name = hashlib.sha256(lock).hexdigest()[:12] + ("-dev" if dev else "")
-    return made_once(default_cache_dir() / "node" / name, partial(_install, dev=dev)) / "node_modules"
+    return made_once(f"node/{name}", partial(_install, dev=dev)) / "node_modules"
 
 
 def _install(folder: Path, dev: bool) -> None:
@@ -87,13 +88,12 @@ def _listed(bundle: Path) -> list[str]:
 def _add_film(site: Path, film: Path | None) -> None:
     if film is None:
         (site / POSES_FILE).write_text("null\n", encoding="utf-8")  # there is none
-        return
-    try:
-        if film.is_dir():
-            shutil.copytree(film, site, dirs_exist_ok=True)
-            return
+    elif (film / POSES_FILE).is_file():
+        for name in (FILM_FILE, POSES_FILE):
+            shutil.copyfile(film / name, site / name)
+    elif film.is_file() and cv2.VideoCapture(str(film)).read()[0]:
         file = f"film{film.suffix.lower()}"
         shutil.copyfile(film, site / file)
-    except FileNotFoundError:
-        raise InputError(f"{film}: no such film; give a video that browsers play") from None
-    (site / POSES_FILE).write_text(json.dumps({"file": file}) + "\n", encoding="utf-8")
+        (site / POSES_FILE).write_text(json.dumps({"file": file}) + "\n", encoding="utf-8")
+    else:
+        raise InputError(f"{film}: no film; give a video that browsers play, as MP4 or WebM")

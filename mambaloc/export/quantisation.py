@@ -18,7 +18,6 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from mambaloc.data import PoseDataModule
-from mambaloc.errors import InputError
 from mambaloc.metrics import PoseErrors, summarise
 from mambaloc.types import PosePrediction
 
@@ -57,7 +56,7 @@ class EightBit:
 
     def __str__(self) -> str:
         errors = f"median {self.position_error_m:.3f} m and {self.rotation_error_deg:.2f}° on {self.frames} test frames"
-        said = f"int8 ({self.kind}): {errors}, {self.loss:+.1%} at most to float32's"
+        said = f"int8 ({self.kind}): {errors}, {self.loss:+.1%} on float32's at most"
         return said if self.fits else f"{said}; {LARGEST_LOSS:.0%} is allowed, so it was left out; take fp16"
 
 
@@ -80,7 +79,7 @@ def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> EightBit:
         quantised = _quantised(prepared, images, kept)
         after = median_errors(quantised, data)
         position_m, rotation_deg = (after[name] for name in ("position_error_m", "rotation_error_deg"))
-        loss = max(position_m / before["position_error_m"], rotation_deg / before["rotation_error_deg"]) - 1
+        loss = max(after[name] / max(before[name], 1e-9) for name in ("position_error_m", "rotation_error_deg")) - 1
         found = EightBit(quantised, kind, position_m, rotation_deg, loss, count)
         if found.fits:
             break
@@ -123,11 +122,11 @@ def _prepared(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def _calibration_images(data: PoseDataModule) -> list[NDArray[np.float32]]:
-    images = torch.cat(list(data.centred_training_images()))
-    if not len(images):
-        raise InputError(f"{data.folder}: holds no training frame to calibrate int8 on; leave int8 out of --to")
-    rows = np.linspace(0, len(images) - 1, min(_CALIBRATION_FRAMES, len(images))).round().astype(int)
-    return [images[row][None].numpy() for row in rows]
+    """Training images evenly spread, one at a time: all of a scene's would fill the memory."""
+    count = len(data.frames("train"))
+    rows = set(np.linspace(0, count - 1, min(_CALIBRATION_FRAMES, count)).round().astype(int).tolist())
+    images = (image for batch in data.centred_training_images() for image in batch)
+    return [image[None].numpy().copy() for row, image in enumerate(images) if row in rows]
 
 
 def _quantised(model: onnx.ModelProto, images: Sequence[NDArray[np.float32]], kept: Sequence[str]) -> onnx.ModelProto:

@@ -1,8 +1,8 @@
 """Localise with an exported model on ONNX Runtime, NumPy and OpenCV alone: nothing here imports torch."""
 
 from mambaloc.runtime.contract import Contract, Preprocessing
-from mambaloc.runtime.localiser import Localisation, Localiser, Trajectory
+from mambaloc.runtime.localiser import Localisation, Localiser
 from mambaloc.runtime.sources import frames_of
 from mambaloc.runtime.trajectory import write_tum
 
-__all__ = ["Contract", "Localisation", "Localiser", "Preprocessing", "Trajectory", "frames_of", "write_tum"]
+__all__ = ["Contract", "Localisation", "Localiser", "Preprocessing", "frames_of", "write_tum"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -49,10 +49,14 @@ def verify_bundle(folder: Path, threads: int | None = None) -> list[Deviation]:
         files, frames = dict(bundle["files"]), list(bundle["frames"])
         for name, entry in files.items():
             _check(folder, name, entry["sha256"])
+        if strange := next((frame["file"] for frame in frames if frame["file"] not in files), None):
+            raise InputError(f"{path}: speaks of the frame {strange}, but not of its digest; write the bundle anew")
+        if not frames or not any("allowed" in entry for entry in files.values()):
+            raise InputError(f"{path}: holds no model, or no frame to check it by; write the bundle anew")
         return list(_replayed(folder, files, frames, threads))
     except OSError as error:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}); give a bundle's folder") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: is no bundle's contract ({reason}); write the bundle anew") from None
 
@@ -65,8 +69,10 @@ def rotation_deg(a: NDArray[np.floating[Any]], b: NDArray[np.floating[Any]]) -> 
 
 
 def _check(folder: Path, name: str, digest: str) -> None:
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
+    path, parts = folder / name, PurePosixPath(name).parts
+    # By its words, too: who copies the bundle joins them with another folder.
+    strange = not parts or ".." in parts or any(character in name for character in "\\:") or name.startswith("/")
+    if strange or not path.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{folder / CONTRACT_FILE}: names {name}, outside of the bundle; do not use it")
     if sha256(path) != digest:
         raise InputError(f"{path}: is not the file that the bundle was written with (sha256 differs); get it anew")

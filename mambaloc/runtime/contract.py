@@ -10,9 +10,13 @@ from mambaloc.errors import InputError
 from mambaloc.images import Image, center_cropped, resized
 
 VERSION = 1
+_MOST_PIXELS = 8192  # of a side
 METADATA_KEY = "mambaloc"
 RAW_INPUT = "rgb"
 """Name of the input of models that resize, crop and scale by themselves."""
+MODEL_FILES = {"onnx": "model.onnx", "fp16": "model.fp16.onnx", "int8": "model.int8.onnx", "ort": "model.ort"}
+"""What a bundle's models are called, by format, the most exact first."""
+
 POSE = (
     "world_from_cam: camera centre in metres, unit quaternion wxyz with w >= 0; "
     "OpenCV camera axes (x right, y down, z forward)"
@@ -89,14 +93,17 @@ class Contract:
             if version != VERSION:
                 raise InputError(f"{where}: contract of version {version!r}, this reads {VERSION}; export it anew")
             height, width = map(int, preprocessing["crop"])
+            short_side = int(preprocessing["short_side"])
+            if not all(1 <= pixels <= _MOST_PIXELS for pixels in (height, width, short_side)):
+                raise ValueError(f"pixels go from 1 to {_MOST_PIXELS}")
             return cls(
                 str(data["model"]),
                 str(data["scene"]),
-                Preprocessing(int(preprocessing["short_side"]), (height, width), bool(preprocessing["in_model"])),
+                Preprocessing(short_side, (height, width), bool(preprocessing["in_model"])),
                 dict(data["trained"]),
                 str(data["weights_sha256"]),
                 str(data["pose"]),
             )
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             reason = f"{type(error).__name__}: {error}"
             raise InputError(f"{where}: its contract cannot be read ({reason}); export the model anew") from None

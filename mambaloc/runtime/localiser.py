@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb, read_image, resized_size
-from mambaloc.runtime.contract import METADATA_KEY, Contract
+from mambaloc.runtime.contract import METADATA_KEY, MODEL_FILES, Contract
 from mambaloc.runtime.sources import frames_of
-
-_IN_A_BUNDLE = ("model.onnx", "model.fp16.onnx", "model.ort", "model.int8.onnx")
 
 
 @dataclass(frozen=True)
@@ -37,26 +33,6 @@ class Localisation:
     position_m: NDArray[np.float32]
     quaternion: NDArray[np.float32]
     latency_s: float
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Where a source's frames were taken, one after another: ``world_from_cam``.
-
-    Shape:
-        ``time_s`` (N,) since the first frame; ``position_m`` (N, 3); ``quaternion`` (N, 4) unit, wxyz, ``w >= 0``.
-
-    Args:
-        time_s: as the video says; of pictures, their place in the list.
-        position_m: in the scene's frame, metres.
-        quaternion: likewise.
-        median_latency_s: of the frames.
-    """
-
-    time_s: NDArray[np.float64]
-    position_m: NDArray[np.float32]
-    quaternion: NDArray[np.float32]
-    median_latency_s: float
 
 
 class Localiser:
@@ -84,6 +60,7 @@ class Localiser:
         if METADATA_KEY not in metadata:
             raise InputError(f"{self.path}: carries no contract of its input; export it with tools/export.py")
         self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
+        self._check_input()
 
     def localise(self, image: str | Path | Image) -> Localisation:
         """Localise one image.
@@ -99,31 +76,26 @@ class Localiser:
         position_m, quaternion = self._session.run(None, {self._session.get_inputs()[0].name: self._fed(rgb)})
         return Localisation(position_m[0], quaternion[0], time.perf_counter() - start)
 
-    def localise_each(self, source: str | Path) -> Trajectory:
-        """Localise every frame of a source, with a progress bar on stderr; Ctrl-C ends it and keeps what was found.
+    def localise_each(self, source: str | Path) -> Iterator[tuple[float, Localisation]]:
+        """Localise a source's frames one after another, each with its time in seconds since the first.
 
         Args:
-            source: a video, a folder of pictures, a picture, or a camera's number.
+            source: a video, a folder of pictures, whose times are their places in the list, or a camera's number.
 
         Raises:
-            InputError: where there is no such source, it holds no frame, or one cannot be localised.
+            InputError: where there is no such source, or a frame cannot be localised.
         """
-        frames, count = frames_of(source)
-        times: list[float] = []
-        poses: list[Localisation] = []
-        with suppress(KeyboardInterrupt):
-            for frame in track(frames, "Localising", count, console=Console(stderr=True), transient=True):
-                poses.append(self.localise(frame.image))
-                times.append(frame.time_s)
-        if not times:
-            raise InputError(f"{source}: holds no frame; give another video")
-        poses = poses[: len(times)]
-        return Trajectory(
-            np.array(times),
-            np.stack([pose.position_m for pose in poses]),
-            np.stack([pose.quaternion for pose in poses]),
-            float(np.median([pose.latency_s for pose in poses])),
-        )
+        for frame in frames_of(source)[0]:
+            yield frame.time_s, self.localise(frame.image)
+
+    def _check_input(self) -> None:
+        """The metadata and the graph may come from two hands."""
+        told, given = self.contract.preprocessing, self._session.get_inputs()[0]
+        expected = ("tensor(uint8)", [3]) if told.in_model else ("tensor(float)", [3, *told.crop])
+        if (given.type, given.shape[-len(expected[1]) :]) != expected:
+            raise InputError(
+                f"{self.path}: takes {given.type} {given.shape}, as its contract does not say; export it anew"
+            )
 
     def _fed(self, rgb: Image) -> NDArray[np.generic]:
         preprocessing = self.contract.preprocessing
@@ -141,9 +113,11 @@ class Localiser:
 
 def _model_file(path: Path) -> Path:
     if path.is_dir():
-        found = [path / name for name in _IN_A_BUNDLE if (path / name).is_file()]
+        found = [path / name for name in MODEL_FILES.values() if (path / name).is_file()]
         if not found:
-            raise InputError(f"{path}: holds none of {', '.join(_IN_A_BUNDLE)}; give a bundle of tools/export.py")
+            raise InputError(
+                f"{path}: holds none of {', '.join(MODEL_FILES.values())}; give a bundle of tools/export.py"
+            )
         return found[0]
     if not path.is_file():
         raise InputError(f"{path}: no such model; tools/export.py writes them")

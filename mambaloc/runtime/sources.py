@@ -61,9 +61,13 @@ def _of_pictures(paths: list[Path]) -> Iterator[SourceFrame]:
 
 
 def _opened(what: str | int, name: str) -> cv2.VideoCapture:
-    capture = cv2.VideoCapture(what)
+    remedy = "give a video that FFmpeg reads" if isinstance(what, str) else "is it plugged in? The first one is 0"
+    try:
+        capture = cv2.VideoCapture(what)
+    except cv2.error:  # a number that no camera can have
+        raise InputError(f"{name}: cannot be opened; {remedy}") from None
     if not capture.isOpened():
-        raise InputError(f"{name}: cannot be opened as a video; give a video that FFmpeg reads")
+        raise InputError(f"{name}: cannot be opened; {remedy}")
     return capture
 
 

@@ -8,10 +8,12 @@ from typing import Any
 
 
 def write_tum(path: Path, time_s: Iterable[float], position_m: Any, quaternion: Any) -> None:
-    """Write lines ``timestamp tx ty tz qx qy qz qw``, of arrays or tensors (N, 3) and (N, 4) wxyz.
+    """Write lines ``timestamp tx ty tz qx qy qz qw``, of arrays or tensors (N, 3) and (N, 4) wxyz, all or none of them.
 
     TUM puts the scalar last, unlike everything else here.
     """
     rows = zip(time_s, position_m.tolist(), quaternion.tolist(), strict=True)
     lines = [" ".join(f"{n:.9g}" for n in (t, *xyz, qx, qy, qz, qw)) for t, xyz, (qw, qx, qy, qz) in rows]
-    path.write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n", encoding="utf-8")
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n", encoding="utf-8")
+    partial.replace(path)

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 from importlib.metadata import version
 from pathlib import Path
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.cache import default_cache_dir
 from mambaloc.evaluation.evaluate import data_of
 from mambaloc.export import write_bundle
-from mambaloc.files import made_once
 from mambaloc.models import LitPoseRegressor
 from mambaloc.models.base import read_checkpoint
+from mambaloc.runtime import contract
+from mambaloc.user_cache import made_once
 from mambaloc.zoo.loading import load, released_folder
-from mambaloc.zoo.manifest import Manifest
+from mambaloc.zoo.manifest import MANIFEST_FILE, Manifest
 
 EMBEDDED = "student.embedded_room"
 """The released model that comes with the package."""
 
 
 def load_with_data(source: str, root: str | None = None) -> tuple[LitPoseRegressor, PoseDataModule]:
-    """Load a trained system, and what it was trained with.
+    """Load a trained system, and the scene that it knows.
+
+    A checkpoint tells all about its data; a released model only which scene: its whole training split is then meant.
 
     Args:
         source: as :func:`mambaloc.load` takes it.
@@ -45,10 +48,11 @@ def released_bundle(name: str = EMBEDDED) -> Path:
     Raises:
         InputError: where there is no such model, or its scene's frames are not there.
     """
-    digest = Manifest.read(released_folder(name)).weights_sha256[:12]
-    folder = default_cache_dir() / "bundles" / f"{name.rpartition('/')[2]}-{digest}-{version('mambaloc')}"
+    folder = released_folder(name)
+    manifest, content = Manifest.read(folder), (folder / MANIFEST_FILE).read_bytes()
+    digest = hashlib.sha256(f"{contract.VERSION}{version('mambaloc')}".encode() + content).hexdigest()[:16]
 
     def make(partial: Path) -> None:
         write_bundle(*load_with_data(name), partial / "bundle", ("onnx",), target="pc")
 
-    return made_once(folder, make) / "bundle"
+    return made_once(f"bundles/{manifest.model}-{digest}", make) / "bundle"

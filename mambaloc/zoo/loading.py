@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import sys
 from difflib import get_close_matches
 from pathlib import Path
@@ -54,7 +55,7 @@ def released_folder(source: str) -> Path:
     if colon and kind == "hf-hub":
         return _from_hub(rest)
     for zoo in _ZOOS:
-        if (zoo / source / MANIFEST_FILE).is_file():
+        if re.fullmatch(r"[a-z0-9_]+\.[a-z0-9_]+", source) and (zoo / source / MANIFEST_FILE).is_file():
             return zoo / source
     near = get_close_matches(source, list_released(), n=3)
     raise InputError(f"{source}: no such model; " + (f"did you mean {', '.join(near)}?" if near else _SOURCES))

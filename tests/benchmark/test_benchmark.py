@@ -1,11 +1,21 @@
 import pytest
 import torch
 
-from mambaloc.benchmark import Latency, LoadingRates, forward_flops, measure_latency, measure_loading, size_of
-from mambaloc.benchmark.report import print_latencies, print_sizes
+from mambaloc.benchmark import (
+    Latency,
+    LoadingRates,
+    forward_flops,
+    measure_deployment,
+    measure_latency,
+    measure_loading,
+    size_of,
+)
+from mambaloc.benchmark.deployment import speed_up
+from mambaloc.benchmark.report import print_deployments, print_latencies, print_sizes
 from mambaloc.benchmark.sizes import UNEXPLAINED
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
+from mambaloc.models import create_model
 from mambaloc.models.base import mib
 
 
@@ -117,3 +127,24 @@ def test_tables_say_what_was_measured(capsys):
     assert "student" in said
     assert "1.030" in said
     assert "a machine" in said
+
+
+@pytest.mark.slow
+def test_deployment_measures_every_form(scenes, capsys):
+    torch.manual_seed(0)
+    data = PoseDataModule("7scenes", str(scenes), "heads", image_size=32, short_side=36)
+    system = create_model("student", backbone="resnet10t", width=16, image_size=32)
+    found = measure_deployment({"a": (system, data), "runs/b/checkpoints/last.ckpt": (system, data)}, 1, 5)
+    assert [each.form.split()[0] for each in found] == ["PyTorch", "float32", "float16", "int8"] * 2
+    torch_, full, half, eight = (each.size for each in found[:4])
+    assert half < 0.6 * full < 0.7 * torch_
+    assert eight < 0.4 * full
+    assert all(len(each.latency_s) == 5 and min(each.latency_s) > 0 for each in found)
+    assert found[1].position_error_m == pytest.approx(found[0].position_error_m, rel=1e-4)
+    assert speed_up(found, found[0])[0] == 1
+    print_deployments(found, 1, "this machine")
+    said = capsys.readouterr().out
+    assert "8 test frames" in said
+    assert "\nb " in said
+    with pytest.raises(InputError, match="--repetitions 3"):
+        measure_deployment({"a": (system, data)}, repetitions=3)

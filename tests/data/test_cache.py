@@ -23,9 +23,10 @@ import numpy as np
 import pytest
 
 from mambaloc.data import cache
-from mambaloc.data.cache import cached_frames, default_cache_dir
+from mambaloc.data.cache import cached_frames
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
+from mambaloc.user_cache import default_cache_dir
 
 SIZE = (32, 24)
 

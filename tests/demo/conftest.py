@@ -49,12 +49,20 @@ def site(bundle, film, tmp_path_factory):
     return build_site(bundle, tmp_path_factory.mktemp("site") / "site", film)
 
 
+@pytest.fixture(scope="session")
+def served():
+    """Serves a folder as long as a block lasts."""
+    return _served
+
+
 @contextmanager
-def served(site, **options):
+def _served(site, **options):
     with serve(site, 0, **options) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield server
-        server.shutdown()
+        try:
+            yield server
+        finally:
+            server.shutdown()
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,6 @@ from datetime import UTC, datetime, timedelta
 import cv2
 import numpy as np
 import pytest
-from conftest import served
 from cryptography import x509
 
 from mambaloc.demo import serve
@@ -30,16 +29,16 @@ def folder(tmp_path):
     return site
 
 
-def asked(server, path, method="GET"):
+def asked(server, path, method="GET", **headers):
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
-    connection.request(method, path)
+    connection.request(method, path, headers=headers)
     answer = connection.getresponse()
     body = answer.read()
     connection.close()
     return answer, body
 
 
-def test_files_come_with_what_threads_and_safety_need(folder):
+def test_files_come_with_what_threads_and_safety_need(folder, served):
     with served(folder) as server:
         answer, body = asked(server, "/")
         assert (answer.status, body.decode()) == (200, PAGE)
@@ -69,7 +68,7 @@ def test_files_come_with_what_threads_and_safety_need(folder):
         "/nothing",
     ],
 )
-def test_nothing_outside_and_no_listing(folder, path):
+def test_nothing_outside_and_no_listing(folder, path, served):
     with served(folder) as server:
         answer, body = asked(server, path)
         assert answer.status in (301, 404)
@@ -77,13 +76,25 @@ def test_nothing_outside_and_no_listing(folder, path):
         assert b"a.mjs" not in body
 
 
-def test_only_reading_is_answered(folder):
+def test_a_link_leads_nowhere_else(folder, served):
+    (folder / "link").symlink_to(folder.parent / "secret.txt")
+    with served(folder) as server:
+        assert asked(server, "/link")[0].status == 404
+
+
+@pytest.mark.parametrize(("host", "status"), [("evil.example", 403), ("evil.example:80", 403), ("localhost:1", 200)])
+def test_no_other_name_leads_here(folder, host, status, served):
+    with served(folder) as server:
+        assert asked(server, "/index.html", Host=host)[0].status == status
+
+
+def test_only_reading_is_answered(folder, served):
     with served(folder) as server:
         for method in ("POST", "PUT", "DELETE"):
             assert asked(server, "/", method)[0].status == 501
 
 
-def test_it_listens_to_this_machine_alone(folder):
+def test_it_listens_to_this_machine_alone(folder, served):
     with served(folder) as server:
         assert server.server_address[0] == "127.0.0.1"
 
@@ -101,18 +112,18 @@ def test_a_port_that_cannot_be_had(folder):
 # --- on the network ---------------------------------------------------------------------------------------------------
 
 
-def test_https_by_a_certificate_of_the_address(folder, tmp_path, monkeypatch):
+def test_https_by_a_certificate_of_the_address(folder, tmp_path, monkeypatch, served):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
     with served(folder, tls=self_signed("127.0.0.1")) as server:
         address = ("127.0.0.1", server.server_port)
-        pem = ssl.get_server_certificate(address)
+        pem = ssl.get_server_certificate(address, timeout=10)
         trusting = ssl.create_default_context(cadata=pem)  # checks the address and the dates
         with (
             socket.create_connection(address) as plain,
             trusting.wrap_socket(plain, server_hostname="127.0.0.1") as tls,
         ):
-            tls.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            tls.sendall(b"GET / HTTP/1.0\r\nHost: 127.0.0.1\r\n\r\n")
             assert tls.recv(64).startswith(b"HTTP/1.1 200")
     certificate = x509.load_pem_x509_certificate(pem.encode())
     lasts = certificate.not_valid_after_utc - datetime.now(UTC)
@@ -120,21 +131,21 @@ def test_https_by_a_certificate_of_the_address(folder, tmp_path, monkeypatch):
     assert not list((tmp_path / "temporary").iterdir())  # no key is left
 
 
-def test_two_certificates_have_two_keys(folder):
+def test_two_certificates_have_two_keys(folder, served):
     pems = []
     for _ in range(2):
         with served(folder, tls=self_signed("127.0.0.1")) as server:
-            pems.append(ssl.get_server_certificate(("127.0.0.1", server.server_port)))
+            pems.append(ssl.get_server_certificate(("127.0.0.1", server.server_port), timeout=10))
     first, second = (x509.load_pem_x509_certificate(pem.encode()).public_key() for pem in pems)
     assert first != second
 
 
-def test_who_does_not_speak_tls_stops_nobody(folder):
+def test_who_does_not_speak_tls_stops_nobody(folder, served):
     with served(folder, tls=self_signed("127.0.0.1")) as server:
         address = ("127.0.0.1", server.server_port)
         silent, rude = socket.create_connection(address), socket.create_connection(address)
         rude.sendall(b"GET / HTTP/1.0\r\n\r\n")
-        assert ssl.get_server_certificate(address)
+        assert ssl.get_server_certificate(address, timeout=10)
         silent.close()
         rude.close()
 

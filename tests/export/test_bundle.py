@@ -171,7 +171,18 @@ def test_a_contract_that_is_none_is_refused(copied):
 
     refused("{", "is no bundle's contract")
     refused("[]", "is no bundle's contract")
-    refused(json.dumps({**whole, "files": {"../model.onnx": {"sha256": ""}}}), "outside of the bundle")
+    for name in (
+        "../model.onnx",
+        f"../{copied.name}/model.onnx",
+        str(copied / "model.onnx"),
+        "frames\\0.png",
+        "C:x",
+        "",
+    ):
+        refused(json.dumps({**whole, "files": {name: {"sha256": ""}}}), "outside of the bundle")
+    refused(json.dumps({**whole, "frames": [{"file": "/etc/hostname"}]}), "but not of its digest")
+    refused(json.dumps({**whole, "files": {}, "frames": []}), "holds no model")
+    refused("[" * 100_000, "is no bundle's contract")
     refused(json.dumps({**whole, "files": {"gone.onnx": {"sha256": ""}}}), "gone.onnx: cannot be read")
     refused(json.dumps({**whole, "frames": [{"file": "frames/0.png"}]}), "is no bundle's contract")
     path.unlink()

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from mambaloc.geometry import canonical
 from mambaloc.images import as_rgb, read_image
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Contract, Localiser, Preprocessing, frames_of
+from mambaloc.runtime.report import follow
 
 DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 48}
 
@@ -68,7 +70,7 @@ def test_the_contract_travels_with_the_model(student, model):
 def test_the_runtime_needs_no_torch(model, tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), picture())
     program = (
-        "import sys; sys.modules['torch'] = None\n"
+        "import sys\nfor name in ('torch', 'rich', 'filelock', 'yaml', 'onnx'): sys.modules[name] = None\n"
         "import mambaloc\nfrom mambaloc.runtime import Localiser\n"
         f"print(Localiser({str(model)!r}).localise({str(tmp_path / 'a.png')!r}).position_m.tolist())\n"
         "heavy = {'lightning', 'timm', 'torchvision'} & set(sys.modules)\nassert not heavy, heavy"
@@ -158,6 +160,13 @@ def test_what_is_no_model(model, tmp_path):
     del plain.metadata_props[:]
     onnx.save(plain, tmp_path / "plain.onnx")
     refused(tmp_path / "plain.onnx", "carries no contract")
+    other = onnx.load(model)
+    for change in ({"crop": (8, 8)}, {"in_model": True}):
+        contract = Localiser(model).contract
+        told = replace(contract, preprocessing=replace(contract.preprocessing, **change))
+        other.metadata_props[0].value = told.to_json()
+        onnx.save(other, tmp_path / "other.onnx")
+        refused(tmp_path / "other.onnx", "its contract does not say")
 
 
 @pytest.mark.parametrize(
@@ -167,6 +176,9 @@ def test_what_is_no_model(model, tmp_path):
         ({"preprocessing": {"short_side": 48}}, "cannot be read"),
         ({"preprocessing": {"short_side": 48, "crop": [1, 2, 3], "in_model": False}}, "cannot be read"),
         ({"trained": 3}, "cannot be read"),
+        ({"preprocessing": {"short_side": 48, "crop": [0, 9], "in_model": False}}, "pixels go from 1"),
+        ({"preprocessing": {"short_side": 10**9, "crop": [9, 9], "in_model": False}}, "pixels go from 1"),
+        ({"preprocessing": {"short_side": 48, "crop": [float("inf"), 9], "in_model": False}}, "cannot be read"),
     ],
 )
 def test_contracts_are_checked(change, message, student):
@@ -200,6 +212,30 @@ def test_a_video_is_read_with_its_times(tmp_path):
     assert count == len(listed) == 4
     assert [frame.time_s for frame in listed] == pytest.approx([0, 0.1, 0.2, 0.3], abs=1e-3)
     assert np.abs(listed[2].image.astype(int) - picture(seed=2)).mean() < 6  # JPEG
+
+
+def test_a_source_is_localised_frame_by_frame(model, tmp_path):
+    for name, seed in (("a.png", 0), ("b.png", 1)):
+        cv2.imwrite(str(tmp_path / name), picture(seed=seed)[..., ::-1])
+    localiser = Localiser(model)
+    found = list(localiser.localise_each(tmp_path))
+    assert [time_s for time_s, _ in found] == [0, 1]
+    np.testing.assert_array_equal(found[1][1].position_m, localiser.localise(picture(seed=1)).position_m)
+
+
+def test_what_was_found_before_a_bad_picture_is_kept(model, tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), picture())
+    (tmp_path / "b.png").write_bytes(b"noise")
+    out = tmp_path / "poses.tum"
+    with pytest.raises(InputError, match=r"b\.png: image cannot be decoded"):
+        follow(Localiser(model), str(tmp_path), out)
+    assert len(out.read_text().splitlines()) == 2  # a comment, and the first
+
+
+def test_where_poses_go_is_asked_before_the_work(model, tmp_path):
+    for out in (tmp_path, tmp_path / "none/poses.tum"):
+        with pytest.raises(InputError, match=r"--out .*: there is no folder"):
+            follow(Localiser(model), "nothing at all", out)
 
 
 def test_what_is_no_source(tmp_path):

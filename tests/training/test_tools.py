@@ -84,7 +84,7 @@ def test_a_checkpoint_is_published(run, tmp_path, capsys):
     ("name", "words", "message"),
     [
         ("export", ["nothing.ckpt"], "nothing.ckpt: no such checkpoint"),
-        ("export", ["{run}/checkpoints/last.ckpt", "--to", "onnx,tflite"], "tflite is none of onnx, fp16, int8, ort"),
+        ("export", ["{run}/checkpoints/last.ckpt", "--to", "onnx,tflite"], "'tflite' is none of onnx, fp16, int8, ort"),
         ("export", ["student.embedded_rom"], "did you mean student.embedded_room?"),
         ("export", ["{run}/checkpoints/last.ckpt", "--out", "{run}"], "is there already"),
         ("verify_bundle", ["nothing"], "give a bundle's folder"),

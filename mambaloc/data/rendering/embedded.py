@@ -53,7 +53,10 @@ def ensure_embedded_scene(root: Path) -> Path:
     if folder := _rendered(root, names, note):
         _add_missing_depth(folder, shots)
         return folder
-    root.mkdir(parents=True, exist_ok=True)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{root}: cannot be rendered to ({error.strerror}); choose another root") from None
     with FileLock(root / f".{EMBEDDED_SCENE}.lock"):
         if folder := _rendered(root, names, note):  # by whoever held the lock before
             return folder

@@ -9,6 +9,7 @@ import { Readout } from "./readout.js";
 import { Film, Stream, decoded, openCamera, optionalJson } from "./sources.js";
 import { View } from "./view.js";
 
+const STILL_PIXELS = 1024; // of a still's longer side on the page; the model is given them all
 const $ = (id) => document.getElementById(id);
 const query = new URLSearchParams(location.search);
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -29,7 +30,7 @@ async function main() {
   const sequences = trajectory?.sequences ?? {};
   openView(sequences);
   readout = new Readout(view?.up ?? null);
-  if (description) film = new Film(description);
+  if (description && Film.plays(description.file)) film = new Film(description);
   $("film-note").textContent = film?.poses ? "A film whose true poses are known." : "";
   $("offer-film").hidden = !film;
   document.querySelector(".key .path").hidden = !Object.keys(sequences).length;
@@ -78,7 +79,11 @@ function listen() {
   $("video").addEventListener("error", ({ target }) => {
     if (target.hasAttribute("src")) fail(new Error("This browser cannot play the film: choose another source."));
   });
-  $("check").addEventListener("click", () => frames?.checkAll());
+  $("check").addEventListener("click", async ({ target }) => {
+    target.disabled = true;
+    await frames?.checkAll();
+    target.disabled = false;
+  });
   $("reset").addEventListener("click", () => view?.reset());
   $("follow").addEventListener("click", () => setFollowing(!view.follows));
 }
@@ -174,7 +179,7 @@ async function startFilm(turn) {
   video.hidden = false;
   startStream(film.poses && ((seconds) => film.frameAt(seconds)));
   if (!calm) await video.play().catch(() => {}); // the browser may want a tap first
-  if (video.paused) setState("ready", "Press Play");
+  if (video.paused && document.body.dataset.state !== "error") setState("ready", "Press Play");
 }
 
 async function startCamera(turn) {
@@ -212,8 +217,13 @@ function startStream(frameAt = null) {
 async function localise(bitmap, truth = null) {
   const turn = visit;
   const { width, height } = bitmap;
-  view?.setPicture(bitmap, width, height);
-  showCrop(width, height);
+  try {
+    view?.setPicture(bitmap, width, height);
+    showCrop(width, height);
+  } catch (error) {
+    bitmap.close();
+    throw error;
+  }
   const pose = await engine.localise(bitmap);
   if (turn === visit) {
     $("error").hidden = true;
@@ -227,8 +237,14 @@ async function localiseStill(blob, name, frame = null) {
   const turn = visit;
   try {
     const bitmap = await decoded(blob, name);
-    const canvas = Object.assign($("still"), { width: bitmap.width, height: bitmap.height, hidden: false });
-    canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    if (turn !== visit) {
+      bitmap.close();
+      return null;
+    }
+    const shrunk = Math.min(1, STILL_PIXELS / Math.max(bitmap.width, bitmap.height));
+    const [width, height] = [bitmap.width, bitmap.height].map((side) => Math.max(1, Math.round(side * shrunk)));
+    const canvas = Object.assign($("still"), { width, height, hidden: false });
+    canvas.getContext("2d").drawImage(bitmap, 0, 0, width, height);
     const pose = await localise(bitmap);
     if (turn !== visit) return null;
     if (frame) readout.showDeviation(deviation(pose, frame), allowed());
@@ -249,8 +265,11 @@ async function takeFile(file) {
 }
 
 async function takeFrame(frame) {
+  const turn = visit;
   const response = await fetch(`bundle/${frame.file}`).catch(() => null);
-  if (response?.ok) return localiseStill(await response.blob(), frame.file, frame);
+  const blob = response?.ok ? await response.blob().catch(() => null) : null;
+  if (turn !== visit) return null;
+  if (blob) return localiseStill(blob, frame.file, frame);
   fail(new Error(`${frame.file} cannot be fetched; is the server still running?`));
   return null;
 }

@@ -1,5 +1,7 @@
 /** The page's side of the worker: promises instead of messages. */
 
+const PATIENCE_MS = 30_000;
+
 /** A running model. One at a time: {@link Engine#stop} the last before starting another. */
 export class Engine {
   #worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
@@ -7,14 +9,27 @@ export class Engine {
   #count = 0;
 
   /**
-   * Load the model.
+   * Load the model; where that fails or hangs, once more on one thread of WebAssembly, which runs everywhere.
    * @param {"auto"|"wasm"|"webgpu"} backend wanted; `info.backend` is the one that runs.
    * @param {(progress: {name: string, loaded: number, total: number}) => void} onProgress of the downloads.
    */
   static async start(backend, onProgress) {
+    // WebKit's WebGPU may end the page in the middle of a network: only for those who ask.
+    const wanted = backend === "auto" && navigator.vendor.startsWith("Apple") ? "wasm" : backend;
+    try {
+      return await Engine.#attempt({ backend: wanted }, onProgress);
+    } catch (error) {
+      const simplest = { backend: "wasm", threads: 1 };
+      const engine = await Engine.#attempt(simplest, onProgress).catch(() => Promise.reject(error));
+      engine.info.note = `One thread of WebAssembly runs the model: ${error.message}`;
+      return engine;
+    }
+  }
+
+  static async #attempt(how, onProgress) {
     const engine = new Engine();
     try {
-      engine.info = await engine.#started(backend, onProgress);
+      engine.info = await engine.#started(how, onProgress);
     } catch (error) {
       engine.stop();
       throw error;
@@ -41,20 +56,28 @@ export class Engine {
     this.#waiting.clear();
   }
 
-  #started(backend, onProgress) {
+  #started(how, onProgress) {
     return new Promise((resolve, reject) => {
+      let timer;
+      const wait = () => {
+        clearTimeout(timer);
+        timer = setTimeout(() => reject(new Error("The model does not start; load the page again.")), PATIENCE_MS);
+      };
       this.#worker.onerror = ({ message }) => {
         const error = new Error(`The model's worker failed (${message || "no reason given"}); load the page again.`);
         reject(error);
         this.#abandon(error);
       };
       this.#worker.onmessage = ({ data }) => {
+        wait(); // from the last sign of life
+        if (data.type !== "progress") clearTimeout(timer);
         if (data.type === "progress") onProgress(data);
         else if (data.type === "ready") resolve(data);
         else if (data.id === undefined) reject(new Error(data.message));
         else this.#settle(data);
       };
-      this.#worker.postMessage({ type: "start", backend });
+      wait();
+      this.#worker.postMessage({ type: "start", ...how });
     });
   }
 

@@ -15,7 +15,7 @@ export async function decoded(blob, name) {
 /** JSON beside the page, or null where there is none. */
 export async function optionalJson(path) {
   const response = await fetch(path).catch(() => null);
-  return response?.ok ? response.json() : null;
+  return response?.ok ? response.json().catch(() => null) : null; // a host may answer with a page instead
 }
 
 /** Hands out a video's frames one after another, and never one while another is worked on. */
@@ -72,6 +72,12 @@ export class Film {
     this.file = file;
     this.fps = fps;
     this.poses = poses;
+  }
+
+  /** Whether this browser says that it may play such a file. */
+  static plays(file) {
+    const type = { webm: 'video/webm; codecs="vp8"', mp4: "video/mp4" }[file.split(".").at(-1)];
+    return !type || document.createElement("video").canPlayType(type) !== "";
   }
 
   /** Of the whole film in memory: it can then be wound back whatever server it is from. */

@@ -53,13 +53,18 @@ export class View {
     for (const poses of Object.values(sequences)) this.#paths.add(tube(poses, 0.004 * this.#bounds.radius));
     this.#furnish();
     this.paint();
+    canvas.addEventListener("webglcontextrestored", () => this.#ask());
     new ResizeObserver(() => this.#resize()).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.paint());
   }
 
   /** Show the film's true path too; null hides it. */
   showTruePath(poses) {
-    if (this.#truePath) this.#world.remove(this.#truePath);
+    if (this.#truePath) {
+      this.#world.remove(this.#truePath);
+      this.#truePath.geometry.dispose();
+      this.#truePath.material.dispose();
+    }
     this.#truePath = poses && tube(poses, 0.004 * this.#bounds.radius);
     if (this.#truePath) this.#world.add(this.#truePath);
     this.paint();

@@ -1,7 +1,7 @@
 /**
  * The network, off the page's thread.
  *
- * Is sent `{type: "start", backend}` once, then `{type: "localise", id, bitmap}`. Answers with `progress`, `ready`,
+ * Is sent `{type: "start", backend, threads}` once, then `{type: "localise", id, bitmap}`. Answers with `progress`, `ready`,
  * `pose` and `error`.
  */
 
@@ -14,6 +14,7 @@ const BACKENDS = {
   webgpu: { library: "ort.webgpu.min.mjs", binary: "ort-wasm-simd-threaded.asyncify.wasm" },
 };
 const MAX_THREADS = 4;
+const STRIP_PIXELS = 2 ** 22; // iOS gives black, and no error, for canvases of more than 2^24
 const ERRORS_ONLY = 3;
 
 let localiser = null;
@@ -21,14 +22,15 @@ let context = null;
 
 self.onmessage = async ({ data }) => {
   try {
-    if (data.type === "start") self.postMessage({ type: "ready", ...(await start(data.backend)) });
+    if (data.type === "start") self.postMessage({ type: "ready", ...(await start(data)) });
     else self.postMessage({ type: "pose", id: data.id, pose: await localiser.localise(pixels(data.bitmap)) });
   } catch (error) {
     self.postMessage({ type: "error", id: data.id, message: error.message });
   }
 };
 
-async function start(wanted) {
+async function start({ backend: wanted, threads }) {
+  if (!self.OffscreenCanvas) throw new Error("This browser is too old to read pictures here; update it.");
   const contract = JSON.parse(new TextDecoder().decode(await fetched("bundle/contract.json")));
   checkContract(contract);
   const file = modelOf(contract);
@@ -40,21 +42,22 @@ async function start(wanted) {
   const info = { contract, verified, webgpu: Boolean(adapter), note: "" };
   if (adapter && preferred) {
     try {
-      return { ...info, ...(await open("webgpu", model, contract)) };
+      return { ...info, ...(await open("webgpu", model, contract, threads)) };
     } catch (error) {
       info.note = `WebAssembly runs the model, for WebGPU cannot here: ${firstLine(error)}`;
     }
   } else if (wanted === "webgpu") {
     info.note = "This browser offers no WebGPU, so WebAssembly runs the model.";
   }
-  return { ...info, ...(await open("wasm", model, contract)) };
+  return { ...info, ...(await open("wasm", model, contract, threads)) };
 }
 
 /** Load one backend, and let the model localise a grey picture: a backend that cannot says so here. */
-async function open(backend, model, contract) {
+async function open(backend, model, contract, most) {
   const { library, binary } = BACKENDS[backend];
   const ort = await import(new URL(library, VENDOR));
-  const threads = self.crossOriginIsolated ? Math.min(MAX_THREADS, navigator.hardwareConcurrency || 1) : 1;
+  const cores = self.crossOriginIsolated ? navigator.hardwareConcurrency || 1 : 1;
+  const threads = Math.min(most ?? MAX_THREADS, cores);
   ort.env.wasm.numThreads = threads;
   ort.env.wasm.wasmPaths = VENDOR.href;
   ort.env.wasm.wasmBinary = await fetched(new URL(binary, VENDOR), "runtime");
@@ -78,16 +81,33 @@ function grey([height, width]) {
   return { data: new Uint8Array(height * width * 3).fill(127), width, height, channels: 3 };
 }
 
-/** The bitmap's RGBA bytes; the bitmap is closed. */
+/** The bitmap's RGBA bytes, read strip by strip; the bitmap is closed. */
 function pixels(bitmap) {
   const { width, height } = bitmap;
-  if (context?.canvas.width !== width || context.canvas.height !== height) {
-    context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  const rows = Math.min(height, Math.max(1, Math.floor(STRIP_PIXELS / width)));
+  if (context?.canvas.width !== width || context.canvas.height !== rows) {
+    context = new OffscreenCanvas(width, rows).getContext("2d", { willReadFrequently: true });
+    context.globalCompositeOperation = "copy";
   }
-  context.globalCompositeOperation = "copy";
-  context.drawImage(bitmap, 0, 0);
-  bitmap.close();
-  return { data: context.getImageData(0, 0, width, height).data, width, height, channels: 4 };
+  const data = new Uint8ClampedArray(4 * width * height);
+  try {
+    for (let top = 0; top < height; top += rows) {
+      const count = Math.min(rows, height - top);
+      context.drawImage(bitmap, 0, top, width, count, 0, 0, width, count);
+      data.set(context.getImageData(0, 0, width, count).data, 4 * width * top);
+    }
+  } finally {
+    bitmap.close();
+  }
+  refuseTransparent(data);
+  return { data, width, height, channels: 4 };
+}
+
+/** A canvas multiplies colours by their opacity, which cannot be undone; in training opacity was dropped. */
+function refuseTransparent(data) {
+  for (let i = 3; i < data.length; i += 4) {
+    if (data[i] !== 255) throw new Error("The picture has transparent parts: save it as a JPEG, and choose that.");
+  }
 }
 
 /** A file's bytes; says how far it is, if it is named. */
