@@ -1,10 +1,12 @@
-"""Measure the library: python tools/benchmark.py sizes | latency | deployment CHECKPOINT ... | loading."""
+"""Measure: python tools/benchmark.py sizes | latency | loading | deployment CHECKPOINT ... | run MATRIX.yaml."""
 
 import argparse
+from pathlib import Path
 
 from mambaloc import benchmark, list_models, provenance
 from mambaloc.console import exits_cleanly, quieten, thread_count
 from mambaloc.data import PoseDataModule
+from mambaloc.matrix import Store, print_plan, read_matrix, run_matrix
 from mambaloc.models.registry import model_class
 from mambaloc.zoo.bundles import load_with_data
 
@@ -13,39 +15,72 @@ from mambaloc.zoo.bundles import load_with_data
 def main() -> None:
     """Measure and print."""
     quieten()
+    args = _parser().parse_args()
+    args.call(args)
+
+
+def _sizes(args: argparse.Namespace) -> None:
+    benchmark.print_sizes(benchmark.size_table())
+
+
+def _latency(args: argparse.Namespace) -> None:
+    systems = [model_class(name).registry_name for name in args.systems or list_models()]
+    found = benchmark.measure_latency(systems, args.image_size, (1, 8), args.repetitions, args.device)
+    benchmark.print_latencies(found, args.image_size, _machine(0 if args.device == "cuda" else None))
+
+
+def _loading(args: argparse.Namespace) -> None:
+    data = PoseDataModule(args.dataset, args.root, args.scene)
+    benchmark.print_loading(benchmark.measure_loading(data), _machine())
+
+
+def _deployment(args: argparse.Namespace) -> None:
+    systems = {source: load_with_data(source) for source in args.sources}
+    found = benchmark.measure_deployment(systems, args.threads, args.repetitions)
+    benchmark.print_deployments(found, args.threads, _machine())
+
+
+def _run(args: argparse.Namespace) -> None:
+    matrix, out = read_matrix(args.matrix), args.out or Path("runs/matrices", args.matrix.stem)
+    if args.dry_run:
+        print_plan(matrix, Store.ended(out))
+        return
+    ended = run_matrix(matrix, out, args.address, args.retry_failed)
+    print(f"{out}: {ended['done']} cells done, {ended['failed']} failed, {ended['found']} of them from before")
+
+
+def _machine(cuda: int | None = None) -> str:
+    return f"{provenance.device_name(cuda)}, commit {provenance.commit()}"
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__)
-    what = parser.add_subparsers(dest="what", required=True)
-    what.add_parser("sizes", help="parameters of every system beside the paper's")
-    latency = what.add_parser("latency", help="forward and training-step times with GIS, as ratios to without")
-    latency.add_argument("systems", nargs="*", help="names; all of them unless given")
-    latency.add_argument("--image-size", type=int, default=224)
-    latency.add_argument("--repetitions", type=int, default=20)
-    latency.add_argument("--device", default="cpu", help="cpu or cuda")
-    deployment = what.add_parser("deployment", help="size, latency, errors of trained systems in every precision")
-    deployment.add_argument(
-        "sources", nargs="+", help="checkpoints or zoo names; the first is what others are faster than"
-    )
-    deployment.add_argument("--threads", type=thread_count, default=2)
-    deployment.add_argument("--repetitions", type=int, default=50)
-    loading = what.add_parser("loading", help="images per second from the cache and decoding every epoch")
+    parts = parser.add_subparsers(required=True)
+    part = parts.add_parser("sizes", help="parameters of every system beside the paper's")
+    part.set_defaults(call=_sizes)
+    part = parts.add_parser("latency", help="forward and training-step times with GIS, as ratios to without")
+    part.add_argument("systems", nargs="*", help="names; all of them unless given")
+    part.add_argument("--image-size", type=int, default=224)
+    part.add_argument("--repetitions", type=int, default=20)
+    part.add_argument("--device", default="cpu", help="cpu or cuda")
+    part.set_defaults(call=_latency)
+    part = parts.add_parser("loading", help="images per second from the cache and decoding every epoch")
     for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
-        loading.add_argument(name, default=default)
-    args = parser.parse_args()
-    cuda = 0 if getattr(args, "device", "cpu") == "cuda" else None
-    machine = f"{provenance.device_name(cuda)}, commit {provenance.commit()}"
-    if args.what == "sizes":
-        benchmark.print_sizes(benchmark.size_table())
-    elif args.what == "loading":
-        benchmark.print_loading(benchmark.measure_loading(PoseDataModule(args.dataset, args.root, args.scene)), machine)
-    elif args.what == "deployment":
-        found = benchmark.measure_deployment(
-            {source: load_with_data(source) for source in args.sources}, args.threads, args.repetitions
-        )
-        benchmark.print_deployments(found, args.threads, machine)
-    else:
-        systems = [model_class(name).registry_name for name in args.systems or list_models()]
-        found = benchmark.measure_latency(systems, args.image_size, (1, 8), args.repetitions, args.device)
-        benchmark.print_latencies(found, args.image_size, machine)
+        part.add_argument(name, default=default)
+    part.set_defaults(call=_loading)
+    part = parts.add_parser("deployment", help="size, latency, errors of trained systems in every precision")
+    part.add_argument("sources", nargs="+", help="checkpoints, zoo names; the first is what others are compared with")
+    part.add_argument("--threads", type=thread_count, default=2)
+    part.add_argument("--repetitions", type=int, default=50)
+    part.set_defaults(call=_deployment)
+    part = parts.add_parser("run", help="train and evaluate a matrix of recipes, what ended before left alone")
+    part.add_argument("matrix", type=Path, help="as recipes/matrices/ holds them")
+    part.add_argument("--out", type=Path, help="folder of results.sqlite and runs/; runs/matrices/NAME unless given")
+    part.add_argument("--address", help="of a Ray cluster, whose machines all see --out")
+    part.add_argument("--retry-failed", action="store_true", help="run cells again that failed")
+    part.add_argument("--dry-run", action="store_true", help="list the cells and what they may take")
+    part.set_defaults(call=_run)
+    return parser
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from types import TracebackType
 from typing import Self
@@ -18,6 +18,35 @@ from mambaloc.matrix.cells import Cell, Matrix
 from mambaloc.matrix.store import StoredCell
 
 _FAILURES = 5  # shown at most
+
+
+def print_plan(matrix: Matrix, ended: Mapping[str, StoredCell]) -> None:
+    """Print a row a cell: its place, whether it ended, and the seconds it took, or cells of its system on average.
+
+    Args:
+        matrix: to run.
+        ended: cells that the store holds, by key.
+    """
+    first = next(iter(matrix.cells[0].labels))
+    seconds: dict[str, list[float]] = {}
+    for kept in ended.values():
+        if kept.error is None:
+            seconds.setdefault(kept.labels.get(first, ""), []).append(kept.seconds)
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for axis in (*matrix.cells[0].labels, "state"):
+        table.add_column(axis)
+    table.add_column("seconds", justify="right")
+    due = 0.0
+    for cell in matrix.cells:
+        before, like = ended.get(cell.key), seconds.get(cell.labels[first])
+        expected = before.seconds if before else sum(like) / len(like) if like else None
+        state = "to run" if before is None else "done" if before.error is None else f"failed: {before.error}"
+        due += 0.0 if before or expected is None else expected
+        table.add_row(*cell.labels.values(), state, "" if expected is None else f"{expected:.0f}")
+    console = Console(highlight=False)
+    console.print(table)
+    known = "" if not seconds else f", about {timedelta(seconds=int(due))} one after another, as far as is known"
+    console.print(f"{len(matrix.cells)} cells, {sum(c.key not in ended for c in matrix.cells)} to run{known}")
 
 
 class MatrixProgress:

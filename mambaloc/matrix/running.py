@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import json
 import os
 import shutil
@@ -34,7 +35,7 @@ class Outcome:
     """How a cell's process ended.
 
     Args:
-        results: what each evaluation's ``metrics.json`` says, by epoch.
+        results: what each evaluation says, by epoch: ``metrics.json``, and ``frames``.
         seconds: that the process took.
         error: why it failed; None where it did not.
     """
@@ -122,10 +123,21 @@ def run_cell(command: tuple[str, ...], run: Path, time_limit_s: float, cpus: flo
                 os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
     seconds = time.perf_counter() - started
-    results = {path.parent.name: json.loads(path.read_text()) for path in sorted(run.glob("evaluation/*/metrics.json"))}
+    results = {
+        path.name: _result(path) for path in sorted(run.glob("evaluation/*")) if (path / "metrics.json").is_file()
+    }
     if error is None and not results:
         error = "ended without an evaluation"
     return Outcome(results if error is None else {}, seconds, error)
+
+
+def _result(evaluation: Path) -> dict[str, Any]:
+    """What ``metrics.json`` says, and under ``frames`` each frame's image and errors, to compare systems by."""
+    result = json.loads((evaluation / "metrics.json").read_text(encoding="utf-8"))
+    with (evaluation / "predictions.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    errors = {name: [float(row[name]) for row in rows] for name in ("position_error_m", "rotation_error_deg")}
+    return {**result, "frames": {"image": [row["image"] for row in rows], **errors}}
 
 
 def _why(code: int, output: Path) -> str | None:

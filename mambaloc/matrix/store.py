@@ -36,7 +36,7 @@ class StoredCell:
         labels: its place on each axis.
         words: of the command.
         error: why it failed; None where it did not.
-        results: what each evaluation's ``metrics.json`` says, by epoch: ``best``, ``last``.
+        results: what each evaluation says, by epoch (``best``, ``last``): ``metrics.json``, and each frame's errors.
         seconds: from its process's start to its end.
         ended: when, ISO 8601, UTC.
     """
@@ -71,6 +71,14 @@ class Store:
             raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
         except sqlite3.Error as error:
             raise InputError(f"{self.path}: is no store of results ({error}); choose another --out") from None
+
+    @classmethod
+    def ended(cls, folder: Path) -> dict[str, StoredCell]:
+        """What :meth:`read` says of a folder's store; nothing where there is none, which is not made."""
+        if not (folder / STORE_FILE).is_file():
+            return {}
+        with cls(folder) as store:
+            return store.read()
 
     def __enter__(self) -> Self:
         return self

@@ -1,17 +1,19 @@
 """Matrices: what their cells are, and that every cell runs once, whatever happens meanwhile."""
 
-import json
 import signal
 import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
+from mambaloc.cli import recipe_arguments
 from mambaloc.errors import InputError
-from mambaloc.matrix import Store, read_matrix, run_matrix, running
+from mambaloc.matrix import Store, print_plan, read_matrix, run_matrix, running
 from mambaloc.matrix.running import run_folder
 
 FAKE = textwrap.dedent(
@@ -31,6 +33,7 @@ FAKE = textwrap.dedent(
     time.sleep(0.2 if "--slow" in words else 0)
     out = run / "evaluation/last"
     out.mkdir(parents=True)
+    (out / "predictions.csv").write_text("image,position_error_m,rotation_error_deg\\nseq-01/a.png,0.5,2\\n")
     (out / "metrics.json").write_text(json.dumps({"metrics": {"position_error_m": 0.5}, "words": words}))
     with open(os.environ["TRIED"], "a") as file:
         file.write(" ".join(words[:-2]) + "\\n")
@@ -257,5 +260,41 @@ def test_a_real_training_is_a_cell(scenes, tiny_recipe, tmp_path, monkeypatch):
         (cell,) = store.read().values()
     assert cell.results["last"]["count"] == 8
     assert cell.results["last"]["training"]["wall_clock"]["train_s"] > 0
-    assert json.dumps(cell.results)
+    frames = cell.results["last"]["frames"]
+    assert frames["image"][0].startswith("seq-03/")
+    median_m = np.median(frames["position_error_m"])
+    assert median_m == pytest.approx(cell.results["last"]["metrics"]["position_error_m"], rel=1e-5)
     assert run_folder(tmp_path / "out", cell.key).is_dir()
+
+
+def test_every_shipped_matrix_names_recipes_that_are_there(monkeypatch, capsys):
+    repository = Path(__file__).parents[2]
+    monkeypatch.chdir(repository)
+    shipped = sorted((repository / "recipes/matrices").glob("*.yaml"))
+    assert shipped
+    for path in shipped:
+        matrix = read_matrix(path)
+        for words in {cell.words for cell in matrix.cells if cell.labels["seed"] == "0"}:
+            options = [word.replace("{system=posenet_learned}", "runs") for word in words]
+            recipe_arguments(options)  # recipes and overlays first, and all there
+        print_plan(matrix, {})
+    assert "108 cells, 108 to run" in capsys.readouterr().out
+
+
+def test_a_plan_tells_what_ended_and_what_it_may_take(folder, capsys):
+    matrix = six(folder)
+    run_matrix(
+        matrix_of(
+            folder,
+            axes={"system": {"a": ["r.yaml", "--a"]}, "seed": {"0": ["--seed_everything", 0]}},
+            always=["--slow"],
+        ),
+        folder / "out",
+    )
+    assert Store.ended(folder / "nothing") == {}
+    assert not (folder / "nothing").exists()
+    print_plan(matrix, Store.ended(folder / "out"))
+    said = capsys.readouterr().out
+    assert said.count("done") == 1
+    assert said.count("to run") == 6
+    assert "6 cells, 5 to run" in said
