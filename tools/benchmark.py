@@ -1,4 +1,4 @@
-"""Measure: python tools/benchmark.py sizes | latency | loading | deployment CHECKPOINT ... | run MATRIX.yaml."""
+"""Measure: tools/benchmark.py sizes | latency | loading | deployment SOURCE ... | run MATRIX | report RESULTS."""
 
 import argparse
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from mambaloc import benchmark, list_models, provenance
 from mambaloc.console import exits_cleanly, quieten, thread_count
 from mambaloc.data import PoseDataModule
-from mambaloc.matrix import Store, print_plan, read_matrix, run_matrix
+from mambaloc.matrix import Store, print_plan, read_matrix, run_matrix, write_report
 from mambaloc.models.registry import model_class
 from mambaloc.zoo.bundles import load_with_data
 
@@ -49,6 +49,12 @@ def _run(args: argparse.Namespace) -> None:
     print(f"{out}: {ended['done']} cells done, {ended['failed']} failed, {ended['found']} of them from before")
 
 
+def _report(args: argparse.Namespace) -> None:
+    out = args.out or args.results / "report"
+    rows, failed = write_report(args.results, out, args.compare, args.epoch)
+    print(f"{out}: report.html, report.md, rows.csv; {len(rows)} rows, {len(failed)} cells failed")
+
+
 def _machine(cuda: int | None = None) -> str:
     return f"{provenance.device_name(cuda)}, commit {provenance.commit()}"
 
@@ -80,6 +86,12 @@ def _parser() -> argparse.ArgumentParser:
     part.add_argument("--retry-failed", action="store_true", help="run cells again that failed")
     part.add_argument("--dry-run", action="store_true", help="list the cells and what they may take")
     part.set_defaults(call=_run)
+    part = parts.add_parser("report", help="what a matrix's results come to, as Markdown, CSV and a page")
+    part.add_argument("results", type=Path, help="the folder that run wrote to")
+    part.add_argument("--compare", nargs=3, action="append", default=[], metavar=("AXIS", "BEFORE", "AFTER"))
+    part.add_argument("--epoch", default="last", choices=("last", "best"))
+    part.add_argument("--out", type=Path, help="folder to write; RESULTS/report unless given")
+    part.set_defaults(call=_report)
     return parser
 
 

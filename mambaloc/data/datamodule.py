@@ -131,6 +131,14 @@ class PoseDataModule(L.LightningDataModule):
         """
         return self._read("train")[0]
 
+    def chosen_training_frames(self) -> Frames:
+        """Read the poses of those training frames that are neither held out nor thinned away, without an image.
+
+        Raises:
+            InputError: where there is none.
+        """
+        return self._chosen()[0]
+
     def frames(self, part: Part) -> Frames:
         """Return the frames of a part, in the order of ``PoseBatch.index``."""
         return self._loaded[part].data.frames
@@ -238,16 +246,21 @@ class PoseDataModule(L.LightningDataModule):
         }
 
     def _load_train_and_val(self) -> None:
-        frames, bad = self._read("train")
-        train, validation = frames, self.hparams["validation"]
+        train, val, thinned_by, bad = self._chosen()
+        if val is not None:
+            self._loaded["val"] = self._with_points(self._decode(val, BadFrames(bad.policy)))
+        self._loaded["train"] = self._in_clips(self._with_points(self._decode(train, bad)), thinned_by)
+
+    def _chosen(self) -> tuple[Frames, Frames | None, float, BadFrames]:
+        """Frames to train on, those held out, how many to one were thinned, and what was left out of all of them."""
+        train, bad = self._read("train")
+        val, validation = None, self.hparams["validation"]
         if validation not in ("none", "test_set"):
             options = {name: self.hparams[f"val_{name}"] for name in ("fraction", "gap", "sequences")}
-            train_rows, val_rows = hold_out(frames, validation, **options)
-            train = frames.select(train_rows)
-            self._loaded["val"] = self._with_points(self._decode(frames.select(val_rows), BadFrames(bad.policy)))
+            train_rows, val_rows = hold_out(train, validation, **options)
+            train, val = train.select(train_rows), train.select(val_rows)
         kept = subsample(train, self.hparams["keep_every"], self.hparams["keep_count"])
-        loaded = self._with_points(self._decode(train.select(kept), bad))
-        self._loaded["train"] = self._in_clips(loaded, len(train) / len(kept))
+        return train.select(kept), val, len(train) / len(kept), bad
 
     def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._loaded[part].data, self.trainer
