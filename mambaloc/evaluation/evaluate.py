@@ -54,6 +54,7 @@ def evaluate_checkpoint(
     system = load_checkpoint(checkpoint)
     data = data or data_of(stored, checkpoint)
     check_image_size(system, data, checkpoint)
+    backbone = _first_backbone(stored) if with_retrieval else None
     started = time.perf_counter()
     table = localise_test_frames(system, data, accelerator)
     seconds = time.perf_counter() - started
@@ -63,7 +64,7 @@ def evaluate_checkpoint(
         "data": data.describe(),
         "split": "test",
         "intervals": _intervals(table, data.frames("test").sequences),
-        "references": {**_references(data, table), **(_retrieval(stored, data, table) if with_retrieval else {})},
+        "references": {**_references(data, table), **(_retrieval(backbone, data, table) if backbone else {})},
         "selection": selection_rule(stored, checkpoint),
         "model": _describe_model(system),
         "training": _describe_training(stored, checkpoint),
@@ -131,14 +132,18 @@ def _references(data: PoseDataModule, table: PoseErrorTable) -> dict[str, dict[s
     return {reference.__name__: reference(train, table) for reference in references}
 
 
-def _retrieval(stored: dict[str, Any], data: PoseDataModule, table: PoseErrorTable) -> dict[str, dict[str, float]]:
+def _first_backbone(stored: dict[str, Any]) -> PooledBackbone:
+    """The backbone as the training started from it."""
     told = stored["hyper_parameters"]
     if not told.get("backbone_weights"):
         raise InputError("--retrieval: this backbone started from scratch; such features find nothing, leave it out")
     names = ("backbone", "backbone_weights", "backbone_args", "pixel_mean", "pixel_std")
+    return PooledBackbone(*(told[name] for name in names))
+
+
+def _retrieval(backbone: PooledBackbone, data: PoseDataModule, table: PoseErrorTable) -> dict[str, dict[str, float]]:
     data.setup("fit")
-    features = frozen_features(PooledBackbone(*(told[name] for name in names)), data)
-    return retrieval(data.frames("train"), *features, table)
+    return retrieval(data.frames("train"), *frozen_features(backbone, data), table)
 
 
 def _intervals(table: PoseErrorTable, sequences: Sequence[str]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """From a training run to an app and the zoo, by the tools alone; and each tool used wrongly."""
 
+import json
 import runpy
 import sys
 from pathlib import Path
@@ -7,7 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import timm
+import torch
 import yaml
+from safetensors.torch import save_file
 
 from mambaloc.data.rendering import default_intrinsics, embedded_room, embedded_shots, render
 
@@ -72,6 +76,19 @@ def embedded_shot(folder):
     return folder / "shot.png"
 
 
+def test_retrieval_is_measured_on_the_features_a_training_starts_from(run, tmp_path, capsys):
+    torch.manual_seed(0)
+    save_file(timm.create_model("resnet10t", num_classes=0).state_dict(), tmp_path / "start.safetensors")
+    weights = ("--model.backbone_weights", tmp_path / "start.safetensors")
+    tool("train", run / "recipe.yaml", *weights, "--trainer.default_root_dir", tmp_path / "run")
+    tool("evaluate", tmp_path / "run/checkpoints/last.ckpt", "--retrieval", "--out", tmp_path / "out")
+    assert "retrieval mean of 5" in capsys.readouterr().out
+    references = json.loads((tmp_path / "out/metrics.json").read_text())["references"]
+    said = {name: each["position_error_m"] for name, each in references.items()}
+    assert list(said) == ["median_training_pose", "nearest_training_pose", "retrieval", "retrieval_mean_of_5"]
+    assert said["nearest_training_pose"] <= said["retrieval"]
+
+
 def test_a_checkpoint_is_published(run, tmp_path, capsys):
     tool("publish", run / "checkpoints/last.ckpt", "--tag", "heads", "--zoo", tmp_path)
     assert str(tmp_path / "student.heads") in capsys.readouterr().out
@@ -87,6 +104,7 @@ def test_a_checkpoint_is_published(run, tmp_path, capsys):
         ("export", ["{run}/checkpoints/last.ckpt", "--to", "onnx,tflite"], "'tflite' is none of onnx, fp16, int8, ort"),
         ("export", ["student.embedded_rom"], "did you mean student.embedded_room?"),
         ("export", ["{run}/checkpoints/last.ckpt", "--out", "{run}"], "is there already"),
+        ("evaluate", ["{run}/checkpoints/last.ckpt", "--retrieval"], "started from scratch"),
         ("verify_bundle", ["nothing"], "give a bundle's folder"),
         ("verify_bundle", ["{run}"], "give a bundle's folder"),
         ("localize", ["nothing.onnx", "0"], "nothing.onnx: no such model"),
