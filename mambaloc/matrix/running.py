@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
+import logging
 import os
 import shutil
 import signal
@@ -192,6 +193,7 @@ def _pool(matrix: Matrix, address: str | None) -> Iterator[Submit]:
         return
     import ray
 
+    logging.getLogger("ray").setLevel(logging.ERROR)  # of itself it speaks of tokens and addresses
     try:
         ray.init(address=address, log_to_driver=False, include_dashboard=False, configure_logging=False)
     except (ConnectionError, ValueError, RuntimeError) as error:
