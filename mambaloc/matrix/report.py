@@ -118,8 +118,13 @@ def _page(rows: Sequence[Row], compared: dict[str, list[Difference]], failed: Se
 
 def _html_table(lines: list[list[str]]) -> str:
     head = "".join(f"<th><button>{html.escape(cell)}</button></th>" for cell in lines[0])
-    body = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in line)}</tr>" for line in lines[1:])
+    body = "".join(f"<tr>{''.join(map(_html_cell, line))}</tr>" for line in lines[1:])
     return f"<div><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _html_cell(text: str) -> str:
+    is_number = text.replace(".", "", 1).isdecimal()
+    return f"<td{' class=number' if is_number else ''}>{html.escape(text)}</td>"
 
 
 def _plot(rows: Sequence[Row]) -> str:
@@ -154,6 +159,7 @@ _HTML = """<!doctype html>
   div { overflow-x: auto }
   table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 13px }
   th, td { padding: .3rem .6rem; border-bottom: 1px solid #ddd; text-align: left; white-space: nowrap }
+  td.number { text-align: right }
   th button { font: inherit; font-weight: 600; background: none; border: 0; padding: 0; cursor: pointer }
   figure { margin: 1rem 0 } svg { max-width: 100%; height: auto }
 </style>

@@ -140,7 +140,7 @@ def _row(labels: dict[str, str], group: list[StoredCell], epoch: str) -> Row:
     split = "official split" if data["official_split"] else "no official split"
     return Row(
         labels=labels,
-        seeds=tuple(cell.labels.get(SEED, "") for cell in group),
+        seeds=tuple(sorted(cell.labels.get(SEED, "") for cell in group)),
         errors=errors,
         train_s=float(np.mean([result["training"]["wall_clock"]["train_s"] for result in results])),
         train_frames=first["training"]["frames"],
