@@ -79,7 +79,8 @@ def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> EightBit:
         quantised = _quantised(prepared, images, kept)
         after = median_errors(quantised, data)
         position_m, rotation_deg = (after[name] for name in ("position_error_m", "rotation_error_deg"))
-        loss = max(after[name] / max(before[name], 1e-9) for name in ("position_error_m", "rotation_error_deg")) - 1
+        ratios = [after[name] / max(before[name], 1e-9) for name in ("position_error_m", "rotation_error_deg")]
+        loss = float(np.max(ratios)) - 1  # NaN stays NaN
         found = EightBit(quantised, kind, position_m, rotation_deg, loss, count)
         if found.fits:
             break

@@ -15,7 +15,7 @@ from mambaloc.demo import serve
 from mambaloc.demo.lan import lan_address, qr_code, self_signed
 from mambaloc.errors import InputError
 
-PAGE = '<!doctype html><script type="importmap">{"imports": {}}</script>'
+PAGE = "<!doctype html><title>a page</title>"
 
 
 @pytest.fixture
@@ -46,10 +46,7 @@ def test_files_come_with_what_threads_and_safety_need(folder, served):
         assert answer.headers["Cross-Origin-Embedder-Policy"] == "require-corp"
         policy = answer.headers["Content-Security-Policy"]
         assert "default-src 'self'" in policy
-        assert "unsafe-eval" not in policy.replace("wasm-unsafe-eval", "")
-        assert (
-            "'sha256-CJt/FpW3RQlGvqBeO/YK74xrTm1ctS6rLMJu1bV4fMc='" in policy
-        )  # by openssl dgst -sha256 -binary | base64
+        assert "script-src 'self' 'wasm-unsafe-eval';" in policy
         assert asked(server, "/sub/a.mjs")[0].headers["Content-Type"] == "text/javascript"
         assert asked(server, "/m.wasm")[0].headers["Content-Type"] == "application/wasm"
 
