@@ -125,11 +125,13 @@ def _validates_on_test(stored: dict[str, Any]) -> bool:
 
 def _references(data: PoseDataModule, table: PoseErrorTable) -> dict[str, dict[str, float]]:
     try:
-        train = data.listed_training_frames()
+        listed, chosen = data.listed_training_frames(), data.chosen_training_frames()
     except InputError:  # a test split alone can be measured too
         return {}
-    references = (median_training_pose, nearest_training_pose)
-    return {reference.__name__: reference(train, table) for reference in references}
+    return {
+        "median_training_pose": median_training_pose(listed, table),
+        "nearest_training_pose": nearest_training_pose(chosen, table),  # of those that were trained on, as in retrieval
+    }
 
 
 def _first_backbone(stored: dict[str, Any]) -> PooledBackbone:
