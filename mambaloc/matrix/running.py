@@ -63,11 +63,12 @@ def run_matrix(matrix: Matrix, out: Path, address: str | None = None, retry_fail
     """
     with Store(out) as store, _alone(out), _pool(matrix, address) as submit:
         ended = store.read()
-        kept = {key for key, cell in ended.items() if cell.error is None or not retry_failed}
-        waiting = [cell for cell in matrix.cells if cell.key not in kept]
-        failed = {key for key in kept if ended[key].error is not None}
-        done = kept - failed
-        with MatrixProgress(matrix, [ended[cell.key] for cell in matrix.cells if cell.key in kept]) as progress:
+        found = [ended[cell.key] for cell in matrix.cells if cell.key in ended]  # it may hold another matrix's too
+        kept = [cell for cell in found if cell.error is None or not retry_failed]
+        failed = {cell.key for cell in kept if cell.error is not None}
+        done = {cell.key for cell in kept} - failed
+        waiting = [cell for cell in matrix.cells if cell.key not in done | failed]
+        with MatrixProgress(matrix, kept) as progress:
             running: dict[Future[Outcome], Cell] = {}
             while waiting or running:
                 for cell in [cell for cell in waiting if set(cell.after) <= done | failed]:

@@ -153,6 +153,12 @@ def test_every_cell_runs_once(folder):
     assert all(cell.seconds > 0.2 for cell in kept.values())
 
 
+def test_another_matrixs_cells_in_the_store_are_not_counted(folder):
+    run_matrix(six(folder), folder / "out")
+    other = matrix_of(folder, axes={"system": {"c": ["r.yaml"]}})
+    assert run_matrix(other, folder / "out") == {"done": 1, "failed": 0, "found": 0}
+
+
 def test_what_fails_is_recorded_and_the_rest_goes_on(folder):
     axes = {
         "system": {
