@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from mambaloc.errors import InputError
 
@@ -16,6 +17,27 @@ def sha256(path: Path) -> str:
     """Digest of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_yaml(path: Path, missing: str, broken: str) -> Any:
+    """Read plain data from a YAML file.
+
+    Args:
+        path: the file.
+        missing: what the user may do where it cannot be read.
+        broken: what the user may do where it is no YAML.
+
+    Raises:
+        InputError: in either case.
+    """
+    import yaml  # only here: exported models run without it
+
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); {broken}") from None
 
 
 @contextmanager

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from mambaloc.errors import InputError
+from mambaloc.files import read_yaml
 
 _KEYS = ("axes", "always", "without", "time_limit_s", "cpus", "gpus")
 _OTHER_RUN = re.compile(r"\{(\w+)=([^{}]+)\}")  # in a word: the run of the cell that differs so
@@ -82,12 +81,7 @@ def read_matrix(path: Path) -> Matrix:
     Raises:
         InputError: where the file is none, or names what is not there.
     """
-    try:
-        told = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a matrix of trainings") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); mend it") from None
+    told = read_yaml(path, "give a matrix of trainings", "mend it")
     if not isinstance(told, dict) or not isinstance(told.get("axes"), dict) or not told["axes"]:
         raise InputError(f"{path}: names no axes; a matrix has 'axes', each with labels and their words")
     if unknown := sorted(set(map(str, told)) - set(_KEYS)):

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from mambaloc.errors import InputError
+from mambaloc.files import read_yaml
 
 VERSION = 1
 MANIFEST_FILE = "manifest.yaml"
@@ -87,12 +88,7 @@ class Manifest:
             InputError: where it is missing or not one, or gives a figure without its provenance.
         """
         path = folder / MANIFEST_FILE
-        try:
-            data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); give a released model's folder") from None
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); get it anew") from None
+        data = read_yaml(path, "give a released model's folder", "get it anew")
         if not isinstance(data, dict) or data.pop("manifest", None) != VERSION:
             raise InputError(f"{path}: is no manifest of version {VERSION}; publish the model anew")
         _check(path, "manifest", data, cls)
