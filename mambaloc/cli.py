@@ -82,6 +82,9 @@ class RecipeCLI(LightningCLI):
                 }
             )
         parser.set_defaults({"best_checkpoint.monitor": "val/loss"})
+        parser.add_argument(
+            "--retrieval", type=bool, default=False, help="also measure retrieval on the backbone's first features"
+        )
         parser.link_arguments("data.image_size", "model.init_args.image_size")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
@@ -94,8 +97,10 @@ class RecipeCLI(LightningCLI):
         """Resume what the command says: Lightning would put the checkpoint's hyperparameters over the recipe's."""
 
     def before_instantiate_classes(self) -> None:
-        """Without validation no epoch is better than another."""
+        """Without validation no epoch is better than another; what only fails at the end is refused here."""
         config = self.config[self.subcommand]
+        if config.get("retrieval") and not config.model.init_args.get("backbone_weights"):
+            raise InputError("retrieval: this backbone starts from scratch, and finds nothing; set it to false")
         if config.data.validation == "none":
             config.best_checkpoint.save_top_k = 0
 
@@ -128,7 +133,10 @@ class RecipeCLI(LightningCLI):
             return
         run_dir = Path(self.trainer.default_root_dir)
         found = [path for name in ("best", "last") if (path := run_dir / "checkpoints" / f"{name}.ckpt").is_file()]
-        if results := [evaluate_checkpoint(path, run_dir / "evaluation" / path.stem) for path in found]:
+        retrieval = self.config[self.subcommand].retrieval
+        if results := [
+            evaluate_checkpoint(path, run_dir / "evaluation" / path.stem, with_retrieval=retrieval) for path in found
+        ]:
             print_table(results)
             print(f"wrote {run_dir}: evaluation/{found[0].stem}/trajectory.png, model.onnx, checkpoints, config.yaml")
 

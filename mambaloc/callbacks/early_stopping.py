@@ -13,7 +13,7 @@ class EarlyStopping(callbacks.EarlyStopping):
 
     Args:
         monitor: a validation metric that should fall.
-        patience: epochs without a new lowest value; 0 never stops.
+        patience: epochs, or validations where they are no epochs, without a new lowest value; 0 never stops.
         min_delta: how much lower counts.
     """
 
@@ -24,3 +24,8 @@ class EarlyStopping(callbacks.EarlyStopping):
         """Compare this epoch's value with the lowest."""
         if self.patience and self.monitor in trainer.callback_metrics:
             super().on_train_epoch_end(trainer, pl_module)
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Likewise, where validation has a rhythm of its own."""
+        if self.patience:
+            super().on_validation_end(trainer, pl_module)

@@ -10,12 +10,15 @@ import torch
 
 from mambaloc.errors import InputError
 
+MEDIANS = ("position_error_m", "rotation_error_deg")
+
 
 class WallClock(L.Callback):
     """Clock set-up, training and validation apart, and how long training took to reach a given error.
 
     Training seconds leave out set-up, validation, checkpoints and export. The clock survives a resume: a
-    checkpoint holds it. On an accelerator it waits for the device before each reading.
+    checkpoint holds it, with ``history``: the medians of each validation and the training seconds before it. On an
+    accelerator it waits for the device before each reading.
 
     Args:
         reach: validation medians, such as ``{"position_error_m": 0.2, "rotation_error_deg": 10}``; the training
@@ -26,16 +29,18 @@ class WallClock(L.Callback):
         self.reach = reach or {}
         self.seconds = {"setup_s": 0.0, "train_s": 0.0, "validation_s": 0.0}
         self.reached_s: float | None = None
+        self.history: list[dict[str, float]] = []
         self._last = time.perf_counter()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the readings so far."""
-        return {**self.seconds, "reached_s": self.reached_s, "reach": dict(self.reach)}
+        return {**self.seconds, "reached_s": self.reached_s, "reach": dict(self.reach), "history": self.history}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from a checkpoint's readings, adding this process's own set-up."""
         self.seconds = {name: state_dict[name] for name in self.seconds}
         self.reached_s = state_dict["reached_s"]
+        self.history = list(state_dict.get("history", []))  # checkpoints before this had none
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """End set-up."""
@@ -55,8 +60,10 @@ class WallClock(L.Callback):
         if trainer.sanity_checking:
             return
         self._lap(pl_module, "validation_s")
+        metrics = trainer.callback_metrics
+        medians = {name: float(metrics[f"val/{name}"]) for name in MEDIANS if f"val/{name}" in metrics}
+        self.history.append({"train_s": self.seconds["train_s"], "step": trainer.global_step, **medians})
         if self.reach and self.reached_s is None:
-            metrics = trainer.callback_metrics
             for name in self.reach:
                 if f"val/{name}" not in metrics:
                     raise InputError(f"wall_clock.reach: no validation metric {name!r}; try position_error_m")

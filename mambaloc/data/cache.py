@@ -37,10 +37,13 @@ class FrameCache:
     Shape:
         ``images`` (K, 3, H, W) uint8 RGB, read-only and memory-mapped; ``rows`` (K,), which image of the list each is:
         K is smaller than the list where bad images were left out.
+
+    ``key`` names what the images were and how they were resized.
     """
 
     images: NDArray[np.uint8]
     rows: NDArray[np.int64]
+    key: str
 
 
 def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_dir: Path | None = None) -> FrameCache:
@@ -72,7 +75,7 @@ def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_
     if not meta["rows"]:
         raise InputError(f"{paths[0].parent}: none of {len(paths)} images can be used")
     rows = np.array(meta["rows"], dtype=np.int64)
-    return FrameCache(np.load(folder / "images.npy", mmap_mode="r")[: len(rows)], rows)
+    return FrameCache(np.load(folder / "images.npy", mmap_mode="r")[: len(rows)], rows, folder.name)
 
 
 def _key(paths: Sequence[Path], short_side: int) -> str:

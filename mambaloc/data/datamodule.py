@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,10 +31,11 @@ Part = Literal["train", "val", "test"]
 
 @dataclass(frozen=True)
 class LoadedSplit:
-    """One part of a scene with what was left out of it."""
+    """One part of a scene, what was left out of it, and a hash of its images and poses."""
 
     data: CachedFrames
     bad: BadFrames
+    fingerprint: str
 
 
 class PoseDataModule(L.LightningDataModule):
@@ -152,6 +154,7 @@ class PoseDataModule(L.LightningDataModule):
             "official_split": is_official(hparams["dataset"], hparams["scene"], self._listed),
             "listed_frames": dict(self._listed),
             **{f"{part}_frames": len(loaded.data.frames) for part, loaded in self._loaded.items()},
+            "fingerprints": {part: loaded.fingerprint for part, loaded in self._loaded.items()},
             "skipped": {part: loaded.bad.counts() for part, loaded in self._loaded.items()},
             "repaired": {part: len(loaded.bad.repaired) for part, loaded in self._loaded.items()},
             "validation": hparams["validation"],
@@ -217,7 +220,9 @@ class PoseDataModule(L.LightningDataModule):
                 f"data.image_size {self.hparams['image_size']}: larger than images resized to {width}x{height}; "
                 "choose a smaller (height, width), or enlarge data.short_side"
             )
-        return LoadedSplit(CachedFrames(frames.select(cache.rows), cache.images), bad)
+        frames = frames.select(cache.rows)
+        fingerprint = hashlib.sha256(f"{cache.key} {frames.digest()}".encode()).hexdigest()
+        return LoadedSplit(CachedFrames(frames, cache.images), bad, fingerprint)
 
     def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
         """Add what each frame may see, of the frames that could be decoded."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -80,6 +81,15 @@ class Frames:
             self.position_m[indices],
             self.quaternion[indices],
         )
+
+    def digest(self) -> str:
+        """Say which frames these are: a hash of their names and poses, wherever they lie."""
+        digest = hashlib.sha256()
+        for path in self.image_paths:
+            digest.update(f"{path.parent.name}/{path.name}\0".encode())
+        digest.update(self.position_m.tobytes())
+        digest.update(self.quaternion.tobytes())
+        return digest.hexdigest()
 
     def by_sequence(self) -> dict[str, NDArray[np.int64]]:
         """Indices of each sequence's frames, in order of first appearance."""

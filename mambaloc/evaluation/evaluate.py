@@ -172,20 +172,11 @@ def _describe_training(stored: dict[str, Any], checkpoint: Path) -> dict[str, An
         "epoch": stored["epoch"] + 1,
         "step": stored["global_step"],
         "wall_clock": clock,
-        "frames": _training_frames(stored, checkpoint),
         "recipe": str(recipe) if recipe.is_file() else None,
         "recipe_sha256": sha256(recipe) if recipe.is_file() else None,
         "checkpoint": str(checkpoint),
         "checkpoint_sha256": sha256(checkpoint),
     }
-
-
-def _training_frames(stored: dict[str, Any], checkpoint: Path) -> int | None:
-    """How many frames it was trained on; None where they are not here."""
-    try:
-        return len(data_of(stored, checkpoint).chosen_training_frames())
-    except InputError:
-        return None
 
 
 def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, data: PoseDataModule) -> None:

@@ -63,8 +63,9 @@ def _table(rows: Sequence[Row], number: Callable[[float], str]) -> list[list[str
         for name in ERRORS:
             line += [number(value) for value in (row.errors[name].mean, row.errors[name].low, row.errors[name].high)]
         beats = {None: "not measured", True: "yes", False: "no"}[row.beats_retrieval]
-        frames = "" if row.train_frames is None else str(row.train_frames)
-        lines.append([*line, f"{row.train_s:.1f}", frames, str(row.test_frames), beats, row.data, row.selection])
+        lines.append(
+            [*line, f"{row.train_s:.1f}", str(row.train_frames), str(row.test_frames), beats, row.data, row.selection]
+        )
     return lines
 
 

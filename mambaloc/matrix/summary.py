@@ -59,7 +59,7 @@ class Row:
     seeds: tuple[str, ...]
     errors: dict[str, Figure]
     train_s: float
-    train_frames: int | None
+    train_frames: int
     test_frames: int
     data: str
     selection: str
@@ -143,7 +143,7 @@ def _row(labels: dict[str, str], group: list[StoredCell], epoch: str) -> Row:
         seeds=tuple(sorted(cell.labels.get(SEED, "") for cell in group)),
         errors=errors,
         train_s=float(np.mean([result["training"]["wall_clock"]["train_s"] for result in results])),
-        train_frames=first["training"]["frames"],
+        train_frames=first["training"]["data"]["train_frames"],
         test_frames=first["count"],
         data=f"{data['dataset']}/{data['scene']}, {split}",
         selection=first["selection"],

@@ -13,6 +13,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from mambaloc import provenance
+from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.losses import build_loss
 from mambaloc.metrics import PoseErrors
@@ -205,6 +206,8 @@ class LitPoseRegressor(L.LightningModule):
             "device": provenance.device_name(self.device.index if self.device.type == "cuda" else None),
             "seed": provenance.seed(),
         }
+        if isinstance(data := getattr(self.trainer, "datamodule", None), PoseDataModule):
+            checkpoint["mambaloc"]["data"] = data.describe()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Remember where the checkpoint came from."""

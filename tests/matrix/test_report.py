@@ -21,7 +21,7 @@ def result(errors_m, retrieval_m=None):
         "data": {"dataset": "7scenes", "scene": "room", "official_split": False},
         "references": references,
         "selection": "last",
-        "training": {"wall_clock": {"train_s": 10.0 * errors_m[0]}, "frames": 40},
+        "training": {"wall_clock": {"train_s": 10.0 * errors_m[0]}, "data": {"train_frames": 40}},
         "frames": {
             "image": [f"seq-0{1 + i // 30}/frame-{i:06d}.color.png" for i in range(FRAMES)],
             "position_error_m": list(errors_m),

@@ -35,7 +35,7 @@ def epoch(callback, trainer, clock, train_s, validation_s, afterwards_s):
 
 def trainer_at(position_error_m):
     metrics = {"val/position_error_m": torch.tensor(position_error_m)}
-    return SimpleNamespace(sanity_checking=False, callback_metrics=metrics)
+    return SimpleNamespace(sanity_checking=False, callback_metrics=metrics, global_step=40)
 
 
 def test_wall_clock_keeps_training_apart_and_survives_a_resume(clock):
@@ -46,6 +46,7 @@ def test_wall_clock_keeps_training_apart_and_survives_a_resume(clock):
     assert first.state_dict() == {
         **{"setup_s": 7, "train_s": 10.5, "validation_s": 3},
         **{"reached_s": None, "reach": {"position_error_m": 0.2}},
+        "history": [{"train_s": 10, "step": 40, "position_error_m": pytest.approx(0.3)}],
     }
     second = WallClock(reach={"position_error_m": 0.2})
     second.load_state_dict(first.state_dict())
@@ -55,6 +56,7 @@ def test_wall_clock_keeps_training_apart_and_survives_a_resume(clock):
     epoch(second, trainer_at(0.1), clock, train_s=20, validation_s=1, afterwards_s=0)
     assert second.seconds == {"setup_s": 11, "train_s": 51.5, "validation_s": 5}
     assert second.reached_s == 30.5
+    assert [reading["train_s"] for reading in second.history] == [10, 30.5, 51]
 
 
 def test_wall_clock_refuses_a_metric_that_is_not_there(clock):
@@ -70,9 +72,12 @@ def test_progress_bar_shows_metres_and_degrees():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "rhythm", [[], ["--trainer.val_check_interval", "3", "--trainer.check_val_every_n_epoch", "null"]]
+)
 @pytest.mark.parametrize(("patience", "epochs"), [(2, 3), (0, 5)])
-def test_early_stopping_waits_for_its_patience(patience, epochs, tiny_recipe, tmp_path):
-    options = ["--early_stopping.patience", str(patience), "--early_stopping.min_delta", "1e9"]
+def test_early_stopping_waits_for_its_patience(patience, epochs, rhythm, tiny_recipe, tmp_path):
+    options = [*rhythm, "--early_stopping.patience", str(patience), "--early_stopping.min_delta", "1e9"]
     main([str(tiny_recipe), *options, "--trainer.max_epochs", "5", "--trainer.default_root_dir", str(tmp_path / "run")])
     with (tmp_path / "run/metrics/version_0/metrics.csv").open() as file:
         assert max(int(row["epoch"]) for row in csv.DictReader(file)) + 1 == epochs
