@@ -1,4 +1,4 @@
-"""Measure: tools/benchmark.py sizes | latency | loading | deployment SOURCE ... | run MATRIX | report RESULTS."""
+"""Measure: tools/benchmark.py sizes | latency | loading | scenes | deployment | run | report, each with --help."""
 
 import argparse
 from pathlib import Path
@@ -32,6 +32,11 @@ def _latency(args: argparse.Namespace) -> None:
 def _loading(args: argparse.Namespace) -> None:
     data = PoseDataModule(args.dataset, args.root, args.scene)
     benchmark.print_loading(benchmark.measure_loading(data), _machine())
+
+
+def _scenes(args: argparse.Namespace) -> None:
+    found = benchmark.measure_scenes(args.dataset, args.root, args.scenes, args.short_side)
+    benchmark.print_scenes(found, _machine())
 
 
 def _deployment(args: argparse.Namespace) -> None:
@@ -74,6 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
         part.add_argument(name, default=default)
     part.set_defaults(call=_loading)
+    part = parts.add_parser("scenes", help="what scenes cost to load whole: seconds, memory, disk")
+    part.add_argument("root", type=Path, help="folder that holds them")
+    part.add_argument("scenes", nargs="*", help="names; every official one that is there unless given")
+    part.add_argument("--dataset", default="7scenes")
+    part.add_argument("--short-side", type=int, default=256, help="what images are resized to, in pixels")
+    part.set_defaults(call=_scenes)
     part = parts.add_parser("deployment", help="size, latency, errors of trained systems in every precision")
     part.add_argument("sources", nargs="+", help="checkpoints, zoo names; the first is what others are compared with")
     part.add_argument("--threads", type=thread_count, default=2)

@@ -3,21 +3,25 @@
 from mambaloc.benchmark.deployment import Deployment, measure_deployment
 from mambaloc.benchmark.latency import Latency, forward_flops, measure_latency
 from mambaloc.benchmark.loading import LoadingRates, measure_loading
-from mambaloc.benchmark.report import print_deployments, print_latencies, print_loading, print_sizes
+from mambaloc.benchmark.report import print_deployments, print_latencies, print_loading, print_scenes, print_sizes
+from mambaloc.benchmark.scenes import SceneCost, measure_scenes
 from mambaloc.benchmark.sizes import Size, size_of, size_table
 
 __all__ = [
     "Deployment",
     "Latency",
     "LoadingRates",
+    "SceneCost",
     "Size",
     "forward_flops",
     "measure_deployment",
     "measure_latency",
     "measure_loading",
+    "measure_scenes",
     "print_deployments",
     "print_latencies",
     "print_loading",
+    "print_scenes",
     "print_sizes",
     "size_of",
     "size_table",

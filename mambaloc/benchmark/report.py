@@ -14,6 +14,7 @@ from mambaloc import provenance
 from mambaloc.benchmark.deployment import Deployment, speed_up
 from mambaloc.benchmark.latency import Latency, forward_flops
 from mambaloc.benchmark.loading import LoadingRates
+from mambaloc.benchmark.scenes import SceneCost
 from mambaloc.benchmark.sizes import UNEXPLAINED, Size
 from mambaloc.export.quantisation import LARGEST_LOSS
 from mambaloc.models.base import mib
@@ -100,9 +101,33 @@ def print_loading(rates: LoadingRates, machine: str) -> None:
     print(f"ratio {rates.ratio:.1f}   {machine}")
 
 
+def print_scenes(scenes: Sequence[SceneCost], machine: str) -> None:
+    """Print a row a scene: frames, seconds, memory, disk; then which are the benchmark's, and which are rendered."""
+    names = ("scene", "frames", "read s", "decode s", "open s", "memory MiB", "disk MiB")
+    table = _table("Scenes loaded whole: train + test frames, images + cache on disk", *names)
+    for each in scenes:
+        train, test = each.counts
+        seconds = (f"{s:.1f}" for s in (each.read_s, each.build_s, each.open_s))
+        memory = f"{(each.peak_bytes - each.start_bytes) / 2**20:.0f}"
+        disk = f"{each.image_bytes / 2**20:.0f} + {each.cache_bytes / 2**20:.0f}"
+        table.add_row(each.scene, f"{train} + {test}", *seconds, memory, disk)
+    console = Console(highlight=False)
+    console.print(table)
+    for said, which in {
+        "of the benchmark's size": [each.scene for each in scenes if each.counts == each.official],
+        "of another size than the benchmark's": [each.scene for each in scenes if each.counts != each.official],
+        "rendered, no real pictures": [each.scene for each in scenes if each.rendered],
+        "with bad frames": [f"{each.scene} ({each.skipped})" for each in scenes if each.skipped],
+    }.items():
+        if which:
+            console.print(f"{said}: {', '.join(which)}", soft_wrap=True)
+    console.print("decode: once, ever; open: from the cache, each run. Memory: the most while loading, with the")
+    console.print(f"cache's mapped pages, less that of the process before. {machine}", soft_wrap=True)
+
+
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for column in columns:
-        text = column in ("system", "gis", "what", "form")
+        text = column in ("system", "gis", "what", "form", "scene")
         table.add_column(column, justify="left" if text else "right", no_wrap=True)
     return table

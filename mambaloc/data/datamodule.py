@@ -18,7 +18,7 @@ from mambaloc import provenance
 from mambaloc.data.augmentation import Jitter, augment, center_corner, center_crop, draw_augmentations
 from mambaloc.data.cache import cached_frames
 from mambaloc.data.cached_dataset import CachedFrames
-from mambaloc.data.datasets import DATASETS, is_official, scene_folder
+from mambaloc.data.datasets import DATASETS, is_official, is_rendered, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
 from mambaloc.data.points import read_points
 from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
@@ -147,11 +147,13 @@ class PoseDataModule(L.LightningDataModule):
 
     def describe(self) -> dict[str, Any]:
         """Say which frames a number comes from: scene, counts, selection rule, what was left out and repaired."""
-        hparams = self.hparams
+        hparams, rendered = self.hparams, is_rendered(self.folder)
+        official = not rendered and is_official(hparams["dataset"], hparams["scene"], self._listed)
         return {
             "dataset": hparams["dataset"],
             "scene": self.folder.name,
-            "official_split": is_official(hparams["dataset"], hparams["scene"], self._listed),
+            "official_split": official,
+            "rendered": rendered,
             "listed_frames": dict(self._listed),
             **{f"{part}_frames": len(loaded.data.frames) for part, loaded in self._loaded.items()},
             "fingerprints": {part: loaded.fingerprint for part, loaded in self._loaded.items()},

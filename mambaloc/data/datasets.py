@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,6 +54,15 @@ def scene_folder(dataset: str, root: Path | None, scene: str) -> Path:
     return root / scene
 
 
+def is_rendered(folder: Path) -> bool:
+    """Whether a scene's ``scene.json`` says that it was rendered: no benchmark's pictures, whatever its poses."""
+    try:
+        note = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(note, dict) and "rendered_by" in note
+
+
 def is_official(dataset: str, scene: str, listed: dict[str, int]) -> bool:
     """Whether the splits read so far (``train``, ``test``) have the frame counts of the official benchmark."""
     official = DATASETS[dataset].official_counts.get(scene)
@@ -61,4 +71,4 @@ def is_official(dataset: str, scene: str, listed: dict[str, int]) -> bool:
     return all(official[split == "test"] == count for split, count in listed.items())
 
 
-__all__ = ["DATASETS", "Dataset", "is_official", "scene_folder"]
+__all__ = ["DATASETS", "Dataset", "is_official", "is_rendered", "scene_folder"]

@@ -8,10 +8,11 @@ from mambaloc.benchmark import (
     measure_deployment,
     measure_latency,
     measure_loading,
+    measure_scenes,
     size_of,
 )
 from mambaloc.benchmark.deployment import speed_up
-from mambaloc.benchmark.report import print_deployments, print_latencies, print_sizes
+from mambaloc.benchmark.report import print_deployments, print_latencies, print_scenes, print_sizes
 from mambaloc.benchmark.sizes import UNEXPLAINED
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
@@ -24,6 +25,29 @@ def test_loading_is_timed_both_ways(scenes):
     rates = measure_loading(data, batches=2, repetitions=3)
     assert len(rates.cached) == len(rates.decoded) == 3
     assert min(rates.cached + rates.decoded) > 0
+
+
+def test_scenes_are_loaded_whole(scenes, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("MAMBALOC_CACHE", str(tmp_path / "cache"))
+    (found,) = measure_scenes("7scenes", scenes, ["heads"], short_side=36)
+    data = PoseDataModule("7scenes", str(scenes), "heads", short_side=36, image_size=32, validation="none")
+    data.setup("fit")
+    data.setup("test")
+    assert found.counts == (len(data.frames("train")), len(data.frames("test")))
+    height, width = data.train_dataloader().dataset.images.shape[-2:]
+    assert found.cache_bytes == pytest.approx(sum(found.counts) * 3 * height * width, rel=0.1)
+    assert found.image_bytes == sum(p.stat().st_size for p in scenes.glob("heads/*/*.color.*"))
+    assert found.rendered
+    assert min(found.read_s, found.build_s, found.open_s) > 0
+    assert [path.name for path in (tmp_path / "cache").iterdir()] == ["frames"]  # that of this test
+    print_scenes([found], "a machine")
+    said = capsys.readouterr().out
+    assert "of another size than the benchmark's: heads" in said
+    assert "rendered, no real pictures: heads" in said
+    with pytest.raises(InputError, match="holds none of chess"):
+        measure_scenes("7scenes", tmp_path, [])
+    with pytest.raises(InputError, match="--dataset nowhere"):
+        measure_scenes("nowhere", tmp_path, [])
 
 
 def test_ratio_is_of_medians():

@@ -184,6 +184,11 @@ def test_official_split_goes_by_the_listed_frames(make, scene, monkeypatch, coun
     module.setup("fit")
     module.setup("test")
     assert module.describe()["official_split"] is official
+    (module.folder / "scene.json").write_text('{"rendered_by": "someone"}')
+    assert module.describe()["official_split"] is False
+    assert module.describe()["rendered"] is True
+    (module.folder / "scene.json").write_text("half a line")
+    assert module.describe()["rendered"] is False
 
 
 def order(module: PoseDataModule, epoch: int) -> list[int]:

@@ -1,0 +1,128 @@
+"""What a scene costs before the first step: reading its labels, decoding it once, opening it again, memory and disk."""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rich.progress import track
+
+from mambaloc.data import PoseDataModule
+from mambaloc.data.datasets import DATASETS, scene_folder
+from mambaloc.data.frames import BadFrames, Split
+from mambaloc.errors import InputError
+from mambaloc.user_cache import default_cache_dir
+
+
+@dataclass(frozen=True)
+class SceneCost:
+    """A scene loaded whole, both splits, in a process of its own.
+
+    Args:
+        scene: its name.
+        listed: frames that its split files list, by split.
+        official: those of the benchmark of that name, train and test; None where there is none.
+        rendered: whether our renderer made it.
+        skipped: bad frames.
+        read_s: reading splits and poses.
+        build_s: decoding every image once, into a cache that was not there.
+        open_s: the whole again, from that cache: what every later run waits for.
+        peak_bytes: largest resident memory of the process, mapped pages of the cache included.
+        start_bytes: its memory before the scene.
+        image_bytes: of the image files.
+        cache_bytes: of the cache.
+    """
+
+    scene: str
+    listed: dict[str, int]
+    official: tuple[int, int] | None
+    rendered: bool
+    skipped: int
+    read_s: float
+    build_s: float
+    open_s: float
+    peak_bytes: int
+    start_bytes: int
+    image_bytes: int
+    cache_bytes: int
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Frames of both splits."""
+        return self.listed["train"], self.listed["test"]
+
+
+def measure_scenes(dataset: str, root: Path, scenes: Sequence[str], short_side: int = 256) -> list[SceneCost]:
+    """Load scenes, one after another, each into a cache that is removed afterwards.
+
+    Args:
+        dataset: ``7scenes`` or ``cambridge``.
+        root: folder that holds the scenes.
+        scenes: their names; every official one that is there, if none is named.
+        short_side: what images are resized to, in pixels.
+
+    Raises:
+        InputError: where a scene is not there, or none is.
+    """
+    if dataset not in DATASETS:
+        raise InputError(f"--dataset {dataset}: there is none; choose one of {', '.join(DATASETS)}")
+    names = list(scenes) or [name for name in DATASETS[dataset].official_counts if (root / name).is_dir()]
+    if not names:
+        raise InputError(f"{root}: holds none of {', '.join(DATASETS[dataset].official_counts)}; name the scenes")
+    kept = default_cache_dir()  # where the disk is that caches are for
+    kept.mkdir(parents=True, exist_ok=True)
+    spawn = multiprocessing.get_context("spawn")  # a fork would begin with this process's memory
+    found = []
+    for name in track(names, "Loading scenes", transient=True):
+        with ProcessPoolExecutor(1, mp_context=spawn) as pool, TemporaryDirectory(dir=kept) as cache:
+            found.append(pool.submit(_measure, dataset, root, name, short_side, cache).result())
+    return found
+
+
+def _measure(dataset: str, root: Path, scene: str, short_side: int, cache: str) -> SceneCost:
+    def load() -> tuple[PoseDataModule, float]:
+        start = time.perf_counter()
+        data = PoseDataModule(
+            dataset, str(root), scene, short_side=short_side, image_size=short_side, validation="none",
+            on_bad_frame="skip", cache_dir=cache,
+        )  # fmt: skip
+        data.setup("fit")
+        data.setup("test")
+        return data, time.perf_counter() - start
+
+    start_bytes = _peak_bytes()
+    start = time.perf_counter()
+    folder = scene_folder(dataset, root, scene)
+    splits: tuple[Split, ...] = ("train", "test")
+    for split in splits:
+        DATASETS[dataset].read_split(folder, split, BadFrames("skip"))
+    read_s = time.perf_counter() - start
+    _, build_s = load()
+    data, open_s = load()
+    told = data.describe()
+    return SceneCost(
+        scene,
+        told["listed_frames"],
+        DATASETS[dataset].official_counts.get(scene),
+        told["rendered"],
+        sum(sum(counts.values()) for counts in told["skipped"].values()),
+        read_s,
+        build_s - read_s,
+        open_s,
+        _peak_bytes(),
+        start_bytes,
+        sum(path.stat().st_size for part in ("train", "test") for path in data.frames(part).image_paths),
+        sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file()),
+    )
+
+
+def _peak_bytes() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak  # kilobytes elsewhere
