@@ -56,8 +56,8 @@ def _run(args: argparse.Namespace) -> None:
 
 def _report(args: argparse.Namespace) -> None:
     out = args.out or args.results / "report"
-    rows, failed = write_report(args.results, out, args.compare, args.epoch)
-    print(f"{out}: report.html, report.md, rows.csv; {len(rows)} rows, {len(failed)} cells failed")
+    rows, failed = write_report(args.results, out, args.compare, args.epoch, args.reach)
+    print(f"{out}: report.html, report.md, tables/, plots/; {len(rows)} rows, {len(failed)} cells failed")
 
 
 def _machine(cuda: int | None = None) -> str:
@@ -97,10 +97,11 @@ def _parser() -> argparse.ArgumentParser:
     part.add_argument("--retry-failed", action="store_true", help="run cells again that failed")
     part.add_argument("--dry-run", action="store_true", help="list the cells and what they may take")
     part.set_defaults(call=_run)
-    part = parts.add_parser("report", help="what a matrix's results come to, as Markdown, CSV and a page")
+    part = parts.add_parser("report", help="what a matrix's results come to, beside the paper's tables")
     part.add_argument("results", type=Path, help="the folder that run wrote to")
     part.add_argument("--compare", nargs=3, action="append", default=[], metavar=("AXIS", "BEFORE", "AFTER"))
     part.add_argument("--epoch", default="last", choices=("last", "best"))
+    part.add_argument("--reach", type=float, metavar="METRES", help="error whose training seconds are told")
     part.add_argument("--out", type=Path, help="folder to write; RESULTS/report unless given")
     part.set_defaults(call=_report)
     return parser

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,9 @@ from mambaloc.matrix.store import StoredCell
 
 SEED = "seed"
 """The axis that rows are means over."""
+
+ALL = "all"
+"""The label, on the first axis, of a difference over all of its labels."""
 
 ERRORS = {"position_error_m": "m", "rotation_error_deg": "°"}
 
@@ -47,23 +51,37 @@ class Row:
         labels: the place, its seed left out.
         seeds: labels of the seeds that were run.
         errors: a figure for each of ``ERRORS``.
-        train_s: mean seconds of training alone.
+        train_s: seconds of training alone, a seed each.
+        steps: of training, a seed each.
         train_frames: that it was trained on.
         test_frames: that its errors are over.
         data: dataset and scene, and whether they are the benchmark's own split.
         selection: how the epoch was chosen.
-        beats_retrieval: of the position's median; None where retrieval was not measured.
+        references: medians of answers that need no training, by name.
+        cells: the results themselves, a seed each.
     """
 
     labels: dict[str, str]
     seeds: tuple[str, ...]
     errors: dict[str, Figure]
-    train_s: float
+    train_s: tuple[float, ...]
+    steps: tuple[int, ...]
     train_frames: int
     test_frames: int
     data: str
     selection: str
-    beats_retrieval: bool | None
+    references: dict[str, dict[str, float]]
+    cells: tuple[dict[str, Any], ...]
+
+    @property
+    def beats_retrieval(self) -> bool | None:
+        """Of the position's median; None where retrieval was not measured."""
+        retrieval = self.references.get("retrieval")
+        return None if retrieval is None else self.errors["position_error_m"].mean < retrieval["position_error_m"]
+
+    def reached_s(self, error_m: float) -> tuple[float | None, ...]:
+        """Training seconds to a median position error, a seed each; None where it never got there."""
+        return tuple(reached_s(cell, error_m) for cell in self.cells)
 
 
 @dataclass(frozen=True)
@@ -71,12 +89,16 @@ class Difference:
     """What one label of an axis changes against another, all else equal, on the same frames.
 
     Args:
-        labels: the place, without the axis and the seed.
+        labels: the place, without the axis and the seed; ``ALL`` on the first axis for the mean over it.
         errors: a figure for each of ``ERRORS``: negative where the change helps.
+        step_ratio: training seconds a step after the change to those before it, a pair each.
+        reach_ratio: steps to the worse of the two last errors, likewise; empty where no curve was kept.
     """
 
     labels: dict[str, str]
     errors: dict[str, Figure]
+    step_ratio: tuple[float, ...]
+    reach_ratio: tuple[float, ...]
 
 
 def rows_of(cells: Iterable[StoredCell], epoch: str = "last") -> list[Row]:
@@ -92,7 +114,7 @@ def rows_of(cells: Iterable[StoredCell], epoch: str = "last") -> list[Row]:
 def differences(
     cells: Iterable[StoredCell], axis: str, before: str, after: str, epoch: str = "last"
 ) -> list[Difference]:
-    """Compare two labels of an axis wherever both were run, seed by seed.
+    """Compare two labels of an axis wherever both were run, seed by seed; then over all of the first axis.
 
     Args:
         cells: of a store.
@@ -104,21 +126,57 @@ def differences(
     Raises:
         InputError: where the axis has no such label.
     """
-    found = []
     cells = list(cells)
     for label in (before, after):
         if not any(cell.labels.get(axis) == label for cell in cells):
             raise InputError(f"--compare {axis}: no cell that ended has {label} there")
+    found = []
+    together: dict[tuple[tuple[str, str], ...], list[Pair]] = {}
     for labels, group in _places(cells, epoch, (SEED, axis)):
-        by_seed: dict[str, dict[str, StoredCell]] = {}
-        for cell in group:
-            by_seed.setdefault(cell.labels.get(SEED, ""), {})[cell.labels[axis]] = cell
-        pairs = [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
-        if pairs:
-            rows = _resamples(pairs[0][0], epoch)
-            errors = {name: _difference(pairs, name, epoch, rows) for name in ERRORS}
-            found.append(Difference(labels, errors))
-    return found
+        if pairs := _pairs(group, axis, before, after, epoch):
+            found.append(_difference(labels, pairs))
+            (first, _), *others = labels.items()
+            together.setdefault(((first, ALL), *others), []).extend(pairs)
+    counts = [sum({**dict(place), first: ""} == {**each.labels, first: ""} for each in found) for place in together]
+    return found + [
+        _difference(dict(place), pairs)
+        for count, (place, pairs) in zip(counts, together.items(), strict=True)
+        if count > 1
+    ]
+
+
+def reached_s(result: dict[str, Any], error_m: float) -> float | None:
+    """Training seconds after which a validation's median position error was first so low; None if it never was."""
+    return next((each["train_s"] for each in history(result) if each["position_error_m"] <= error_m), None)
+
+
+def history(result: dict[str, Any]) -> list[dict[str, float]]:
+    """Step, training seconds and median errors of each validation; none where none was kept."""
+    return result["training"]["wall_clock"].get("history", [])
+
+
+def data_label(result: dict[str, Any]) -> str:
+    """Say which frames an error is over: the benchmark's own, rendered ones, or others."""
+    data, counts = result["data"], frame_counts(result)
+    if data["official_split"]:
+        return f"{data['dataset']}/{data['scene']}, official split"
+    kind = "rendered, not the benchmark" if data.get("rendered") else "no official split"
+    return f"{data['dataset']}/{data['scene']}, {kind} ({counts[0]} training and {counts[1]} test frames)"
+
+
+def frame_counts(result: dict[str, Any]) -> tuple[int, int]:
+    """Frames that the training and the test split list, before any is left out."""
+    return result["training"]["data"]["listed_frames"]["train"], result["data"]["listed_frames"]["test"]
+
+
+Pair = tuple[dict[str, Any], dict[str, Any]]
+
+
+def _pairs(group: list[StoredCell], axis: str, before: str, after: str, epoch: str) -> list[Pair]:
+    by_seed: dict[str, dict[str, dict[str, Any]]] = {}
+    for cell in group:
+        by_seed.setdefault(cell.labels.get(SEED, ""), {})[cell.labels[axis]] = cell.results[epoch]
+    return [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
 
 
 def _places(
@@ -129,31 +187,34 @@ def _places(
         if cell.error is None and epoch in cell.results:
             place = tuple((axis, label) for axis, label in cell.labels.items() if axis not in without)
             places.setdefault(place, []).append(cell)
-    return [(dict(place), group) for place, group in places.items()]
+    order: dict[str, list[str]] = {}  # of labels as they come: cells that end side by side end in any order
+    for axis, label in itertools.chain.from_iterable(places):
+        order.setdefault(axis, []).append(label)
+    ranks = sorted(places, key=lambda place: [order[axis].index(label) for axis, label in place])
+    return [(dict(place), places[place]) for place in ranks]
 
 
 def _row(labels: dict[str, str], group: list[StoredCell], epoch: str) -> Row:
+    group = sorted(group, key=lambda cell: cell.labels.get(SEED, ""))
     results = [cell.results[epoch] for cell in group]
-    first, rows = results[0], _resamples(group[0], epoch)
-    errors = {name: _figure([_medians(result, name, rows) for result in results]) for name in ERRORS}
-    data, retrieval = first["data"], first["references"].get("retrieval")
-    split = "official split" if data["official_split"] else "no official split"
+    first, rows = results[0], _resamples(results[0])
     return Row(
         labels=labels,
-        seeds=tuple(sorted(cell.labels.get(SEED, "") for cell in group)),
-        errors=errors,
-        train_s=float(np.mean([result["training"]["wall_clock"]["train_s"] for result in results])),
+        seeds=tuple(cell.labels.get(SEED, "") for cell in group),
+        errors={name: _figure([_medians(result, name, rows) for result in results]) for name in ERRORS},
+        train_s=tuple(result["training"]["wall_clock"]["train_s"] for result in results),
+        steps=tuple(result["training"]["step"] for result in results),
         train_frames=first["training"]["data"]["train_frames"],
         test_frames=first["count"],
-        data=f"{data['dataset']}/{data['scene']}, {split}",
+        data=data_label(first),
         selection=first["selection"],
-        beats_retrieval=None if retrieval is None else errors["position_error_m"].mean < retrieval["position_error_m"],
+        references=first["references"],
+        cells=tuple(results),
     )
 
 
-def _resamples(cell: StoredCell, epoch: str) -> NDArray[np.int64]:
-    images = cell.results[epoch]["frames"]["image"]
-    return block_resamples([image.rpartition("/")[0] for image in images])
+def _resamples(result: dict[str, Any]) -> NDArray[np.int64]:
+    return block_resamples([image.rpartition("/")[0] for image in result["frames"]["image"]])
 
 
 def _medians(result: dict[str, Any], name: str, rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -162,12 +223,31 @@ def _medians(result: dict[str, Any], name: str, rows: NDArray[np.int64]) -> NDAr
     return np.array([np.median(errors), *np.median(errors[rows], axis=1)])
 
 
-def _difference(pairs: list[tuple[StoredCell, StoredCell]], name: str, epoch: str, rows: NDArray[np.int64]) -> Figure:
-    told = [[_medians(cell.results[epoch], name, rows) for cell in pair] for pair in pairs]
-    return _figure([after - before for before, after in told])
+def _difference(labels: dict[str, str], pairs: list[Pair]) -> Difference:
+    rows = _resamples(pairs[0][0])
+    errors = {}
+    for name in ERRORS:
+        told = [[_medians(result, name, rows) for result in pair] for pair in pairs]
+        errors[name] = _figure([after - before for before, after in told])
+    reach = tuple(ratio for pair in pairs if (ratio := _reach_ratio(pair)) is not None)
+    return Difference(labels, errors, tuple(_step_s(after) / _step_s(before) for before, after in pairs), reach)
 
 
 def _figure(medians: list[NDArray[np.float64]]) -> Figure:
     mean = np.mean(medians, axis=0)
     low, high = np.quantile(mean[1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Figure(float(mean[0]), float(low), float(high))
+
+
+def _step_s(result: dict[str, Any]) -> float:
+    return result["training"]["wall_clock"]["train_s"] / result["training"]["step"]
+
+
+def _reach_ratio(pair: Pair) -> float | None:
+    """Steps to an error that both got to, the worse of their last ones: after, to before."""
+    curves = [history(result) for result in pair]
+    if not all(curves):
+        return None
+    shared_m = max(curve[-1]["position_error_m"] for curve in curves)
+    before, after = (next(e["step"] for e in curve if e["position_error_m"] <= shared_m) for curve in curves)
+    return after / before
