@@ -280,7 +280,7 @@ def test_every_shipped_matrix_names_recipes_that_are_there(monkeypatch, capsys):
     assert shipped
     for path in shipped:
         matrix = read_matrix(path)
-        for words in {cell.words for cell in matrix.cells if cell.labels["seed"] == "0"}:
+        for words in {cell.words for cell in matrix.cells if cell.labels.get("seed", "0") == "0"}:
             options = [word.replace("{system=posenet_learned}", "runs") for word in words]
             recipe_arguments(options)  # recipes and overlays first, and all there
         print_plan(matrix, {})

@@ -74,6 +74,7 @@ def test_misplaced_recipe_is_refused(words, rule, tmp_path, monkeypatch):
         (["--model.backbone", "resnet10x"], ["resnet10x", "resnet10t"]),
         (["--ckpt_path", "nothing.ckpt"], ["nothing.ckpt"]),
         (["--data.image_size", "64"], ["short_side"]),
+        (["--retrieval", "true"], ["retrieval", "scratch"]),
     ],
 )
 def test_mistake_is_one_line_and_exit_code_2(options, words, tiny_recipe, capsys):
@@ -97,6 +98,10 @@ def test_run_leaves_everything(finished):
     assert metrics["data"]["official_split"] is False
     clock = metrics["training"]["wall_clock"]
     assert 0 < clock["reached_s"] <= clock["train_s"]
+    assert [reading["step"] for reading in clock["history"]] == sorted({r["step"] for r in clock["history"]})
+    trained_on = metrics["training"]["data"]
+    assert trained_on["train_frames"] < trained_on["listed_frames"]["train"]  # some are held out
+    assert len(trained_on["fingerprints"]["train"]) == len(metrics["data"]["fingerprints"]["test"]) == 64
     assert {"commit", "seed", "device", "versions", "recipe_sha256"} <= metrics["training"].keys()
 
 

@@ -66,7 +66,7 @@ def test_recipe_runs(recipe, scenes, cambridge, teacher, tmp_path):
 @pytest.mark.parametrize("overlay", OVERLAYS, ids=lambda path: path.stem)
 def test_overlay_changes_what_it_says(overlay, tiny_recipe, tmp_path):
     def run(*recipes):
-        cli = main([*map(str, recipes), "--trainer.fast_dev_run", "1"])
+        cli = main([*map(str, recipes), "--trainer.fast_dev_run", "1", "--retrieval", "false"])
         return {"model": cli.model.hparams, "data": cli.datamodule.hparams}
 
     base = [tiny_recipe, overlay.with_name("gis_none.yaml")] if overlay.stem == "gis" else [tiny_recipe]
