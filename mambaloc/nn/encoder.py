@@ -131,10 +131,21 @@ class TokenEncoder(nn.Module):
 
     def forward(self, feats_BCHW: Tensor) -> Tensor:
         """Return the token's final state."""
+        tokens_BND, positions_ND = self._before_the_last_layer(feats_BCHW)
+        return self.norm(self.layers[-1](tokens_BND, positions_ND, keep=1)[:, 0])  # only the token is read
+
+    def cells(self, feats_BCHW: Tensor) -> Tensor:
+        """Return every cell's final state, which :meth:`forward` leaves out; (B, dim, rows, columns)."""
+        tokens_BND, positions_ND = self._before_the_last_layer(feats_BCHW)
+        cells_BND = self.norm(self.layers[-1](tokens_BND, positions_ND)[:, 1:])
+        return cells_BND.mT.unflatten(-1, feats_BCHW.shape[-2:])
+
+    def _before_the_last_layer(self, feats_BCHW: Tensor) -> tuple[Tensor, Tensor]:
+        """The token and the cells after all layers but the last, (B, N, dim), and their positions, (N, dim)."""
         cells_BND = self.project(feats_BCHW).flatten(2).mT
         tokens_BND = torch.cat((self.token.expand(cells_BND.shape[0], -1, -1), cells_BND), dim=1)
         positions_ND = self.positions()
-        *layers, last = self.layers
+        *layers, _ = self.layers
         for layer in layers:
             tokens_BND = layer(tokens_BND, positions_ND)
-        return self.norm(last(tokens_BND, positions_ND, keep=1)[:, 0])  # only the token is read
+        return tokens_BND, positions_ND

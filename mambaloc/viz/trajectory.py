@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -25,7 +26,6 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
         title: heads the plot, before the medians.
     """
     figure = Figure(figsize=(7.0, 7.4), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 1, height_ratios=(14, 1))
     axes = figure.add_subplot(grid[0], projection="3d")
     true_m, predicted_m = table.true_position_m.cpu().numpy(), table.predicted_position_m.cpu().numpy()
@@ -49,17 +49,38 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
         axis.labelpad = 8
     axes.set_aspect("equal")
 
-    summary = summarise(table)
-    axes.set_title(
-        f"{title}\nmedian {summary['position_error_m']:.3f} m, {summary['rotation_error_deg']:.2f}° "
-        f"over {len(table.index)} frames"
-    )
+    axes.set_title(f"{title}\n{medians(table)} over {len(table.index)} frames")
     bar = figure.add_subplot(grid[1])
     errors_deg = table.rotation_error_deg.cpu().numpy()
     top = round(max(1.0, float(np.percentile(errors_deg, 95))), 1)
     image = bar.imshow(errors_deg[None], aspect="auto", cmap="viridis", vmin=0, vmax=top, interpolation="nearest")
     bar.set(yticks=[], xlabel="frame")
     figure.colorbar(image, ax=bar, label="rotation\nerror [°]", extend="max", ticks=[0, top], aspect=4)
+    write_png(figure, path)
+
+
+def medians(table: PoseErrorTable) -> str:
+    """Say a split's median errors."""
+    summary = summarise(table)
+    return f"median {summary['position_error_m']:.3f} m, {summary['rotation_error_deg']:.2f}°"
+
+
+def means(table: PoseErrorTable) -> str:
+    """Say a split's mean errors."""
+    summary = summarise(table)
+    return f"mean {summary['position_error_mean_m']:.3f} m, {summary['rotation_error_mean_deg']:.2f}°"
+
+
+def write_png(figure: Figure, path: Path, dpi: int = 100, margin_in: float | None = None) -> None:
+    """Write a figure beside its place, and move it there whole.
+
+    Args:
+        figure: what was drawn.
+        path: the PNG.
+        dpi: pixels an inch.
+        margin_in: cut the figure to what is on it and this many inches around; None keeps its size.
+    """
     partial = path.with_name(f".{path.name}.partial")
-    canvas.print_png(partial)
+    box: Literal["tight"] | None = None if margin_in is None else "tight"
+    FigureCanvasAgg(figure).print_figure(partial, format="png", dpi=dpi, bbox_inches=box, pad_inches=margin_in)
     partial.replace(path)

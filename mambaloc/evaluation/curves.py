@@ -1,0 +1,122 @@
+"""Curves of trained systems side by side: errors frame by frame, while training, and over training sets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.evaluation.intervals import block_resamples, median_interval
+from mambaloc.metrics import PoseErrorTable
+from mambaloc.models.base import read_checkpoint
+from mambaloc.viz.curves import Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
+from mambaloc.viz.trajectory import write_png
+
+if TYPE_CHECKING:
+    from mambaloc.evaluation.figures import Trained
+
+_ERRORS = {"position_error_m": "position error (m)", "rotation_error_deg": "rotation error (°)"}
+
+
+def draw_cumulative(trained: Sequence[Trained], path: Path, title: str) -> None:
+    """Draw the share of test frames whose error is at most so large; a line a system, all its checkpoints together."""
+    tables = {
+        name: [localise_test_frames(each.system, each.data) for each in of] for name, of in _by_name(trained).items()
+    }
+
+    def draw(axes: Axes, error: str) -> None:
+        errors = {name: _joined(of, error) for name, of in tables.items()}
+        plot_cumulative(axes, errors)
+        axes.set(xlabel=_ERRORS[error], ylabel="share of test frames")
+        axes.set(xlim=(0, most_shown(errors.values())), ylim=(0, 1))
+
+    _write(draw, path, title)
+
+
+def draw_time(trained: Sequence[Trained], path: Path, title: str) -> None:
+    """Draw the validation errors of each checkpoint's training against its seconds.
+
+    Raises:
+        InputError: where a training kept no curve, as without validation.
+    """
+    histories: dict[Path, list[dict[str, float]]] = {}
+    for each in trained:
+        states = read_checkpoint(each.checkpoint)["callbacks"].items()
+        histories[each.checkpoint] = next((s["history"] for n, s in states if n.startswith("WallClock")), [])
+        if not histories[each.checkpoint]:
+            raise InputError(f"{each.checkpoint}: its training was not validated; train with data.validation")
+
+    def draw(axes: Axes, error: str) -> None:
+        curves: dict[str, list[tuple[list[float], list[float]]]] = {}
+        for each in trained:
+            history = histories[each.checkpoint]
+            line = ([reading["train_s"] for reading in history], [reading[error] for reading in history])
+            curves.setdefault(each.name, []).append(line)
+        plot_errors_by_time(axes, curves)
+        axes.set(xlabel="training time (s)", ylabel=f"validation, median {_ERRORS[error]}")
+        axes.set_xlim(left=0)
+        axes.set_ylim(bottom=0)
+
+    _write(draw, path, title)
+
+
+def draw_sparsity(trained: Sequence[Trained], path: Path, title: str) -> None:
+    """Draw test medians, with their intervals over blocks of frames, against the number of training frames.
+
+    Checkpoints of one system and one number of frames stand for their first: no mean over seeds is taken.
+
+    Raises:
+        InputError: where a checkpoint does not say how many frames it was trained on.
+    """
+    tables = [(each, localise_test_frames(each.system, each.data)) for each in trained]
+
+    def draw(axes: Axes, error: str) -> None:
+        points: dict[str, list[Point]] = {}
+        for each, table in tables:
+            point = _point(each, table, error)
+            if point.frames not in {other.frames for other in points.setdefault(each.name, [])}:
+                points[each.name].append(point)
+        plot_errors_by_frames(axes, points)
+        axes.set(xlabel="training frames", ylabel=f"median {_ERRORS[error]}")
+        axes.set_ylim(bottom=0)
+
+    _write(draw, path, title)
+
+
+def _point(trained: Trained, table: PoseErrorTable, error: str) -> Point:
+    data = read_checkpoint(trained.checkpoint)["mambaloc"].get("data")
+    if data is None:
+        raise InputError(f"{trained.checkpoint}: does not say how many frames it was trained on; train it again")
+    sequences = trained.data.frames("test").sequences
+    errors = getattr(table, error).cpu().double().numpy()
+    low, high = median_interval(errors, block_resamples([sequences[i] for i in table.index.tolist()]))
+    return Point(data["train_frames"], float(np.median(errors)), low, high)
+
+
+def _by_name(trained: Sequence[Trained]) -> dict[str, list[Trained]]:
+    found: dict[str, list[Trained]] = {}
+    for each in trained:
+        found.setdefault(each.name, []).append(each)
+    return found
+
+
+def _joined(tables: Sequence[PoseErrorTable], error: str) -> NDArray[np.float64]:
+    return np.concatenate([getattr(table, error).cpu().double().numpy() for table in tables])
+
+
+def _write(draw: Callable[[Axes, str], None], path: Path, title: str) -> None:
+    """Both errors side by side, under one legend."""
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    for axes, error in zip(figure.subplots(1, 2), _ERRORS, strict=True):
+        draw(axes, error)
+    figure.suptitle(title, fontsize=11)
+    handles, names = axes.get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
+    write_png(figure, path, dpi=140)

@@ -1,0 +1,215 @@
+"""The paper's figures: which systems are run on which frames, and where the pictures go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mambaloc.data import PoseDataModule
+from mambaloc.errors import InputError
+from mambaloc.evaluation.curves import draw_cumulative, draw_sparsity, draw_time
+from mambaloc.evaluation.evaluate import check_image_size, localise_test_frames, selection_rule
+from mambaloc.geometry import position_error_m, rotation_error_deg
+from mambaloc.models import LitPoseRegressor, load_checkpoint
+from mambaloc.models.base import read_checkpoint
+from mambaloc.types import PoseBatch
+from mambaloc.viz import (
+    BranchHeat,
+    draw_features,
+    draw_heat_maps,
+    draw_top_view,
+    draw_trajectory,
+    heat_maps,
+    position_features,
+    principal_colors,
+    write_scene_page,
+)
+
+MOST_FRAMES = 12
+"""Frames side by side in one figure."""
+
+_OUTDOORS = {"cambridge"}
+_GIS = {"gis": "with GIS", "classical": "with classical Mamba", "none": "without GIS"}
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained system, and the scene that it is looked at in."""
+
+    checkpoint: Path
+    system: LitPoseRegressor
+    data: PoseDataModule
+    chosen: str
+
+    @property
+    def name(self) -> str:
+        """Which system, and its GIS."""
+        return f"{self.system.registry_name} {_GIS[self.system.hparams['gis']]}"
+
+    @property
+    def run(self) -> str:
+        """Which epoch of which run."""
+        return f"{self.chosen} epoch, seed {self.system.provenance.get('seed')}"
+
+
+def load_trained(checkpoint: Path, data: PoseDataModule) -> Trained:
+    """Load a checkpoint for :func:`draw_figures`.
+
+    Raises:
+        InputError: for a bad checkpoint, or data whose crops it was not trained on.
+    """
+    chosen = selection_rule(read_checkpoint(checkpoint), checkpoint).split(":")[0]
+    trained = Trained(checkpoint, load_checkpoint(checkpoint), data, chosen)
+    check_image_size(trained.system, data, checkpoint)
+    return trained
+
+
+def draw_figures(kind: str, trained: Sequence[Trained], out: Path, frames: int = 3) -> list[Path]:
+    """Draw a kind of figure of trained systems.
+
+    Args:
+        kind: a key of :data:`FIGURES`.
+        trained: the systems; all kinds but ``trajectory`` show them in one picture, on the same frames.
+        out: the folder to write to.
+        frames: how many test frames, evenly spaced, ``heatmaps`` and ``features`` show.
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: for frames that are not there, systems that do not go into one figure, or a folder that cannot be
+            written.
+    """
+    if not 1 <= frames <= MOST_FRAMES:
+        raise InputError(f"--frames {frames}: give 1 to {MOST_FRAMES}")
+    with _writing(out):
+        out.mkdir(parents=True, exist_ok=True)  # told now rather than once all is computed
+    return FIGURES[kind](trained, out, frames)
+
+
+def _trajectory(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
+    """A picture and a page a system, of every test frame."""
+    written = []
+    for number, each in enumerate(trained, start=1):
+        table, told = localise_test_frames(each.system, each.data), each.data.frames("test")
+        stem = "trajectory" if len(trained) == 1 else f"trajectory_{number}"
+        picture, page = out / f"{stem}.png", out / f"{stem}.html"
+        title = f"{each.name}, {each.run}\n{_where(each.data)}"
+        draw = draw_top_view if each.data.hparams["dataset"] in _OUTDOORS else draw_trajectory
+        names = [f"{path.parent.name}/{path.name}" for path in told.image_paths]
+        with _writing(out):
+            draw(table, told.sequences, picture, title)
+            write_scene_page(table, told.sequences, names, page, title)
+        written += [picture, page]
+    return written
+
+
+def _heatmaps(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
+    """Grad-CAM of both branches, a row a system."""
+    batch, rows = _same_frames(trained, frames), []
+    for each in trained:
+        with torch.no_grad():
+            prediction = each.system(batch.image)
+        errors_m = position_error_m(prediction.position_m, batch.position_m)
+        errors_deg = rotation_error_deg(prediction.quaternion, batch.quaternion)
+        maps = heat_maps(each.system.network, batch.image)
+        rows.append(BranchHeat(_beside(each), *maps, errors_m, errors_deg))
+    path = out / "heatmaps.png"
+    with _writing(out):
+        draw_heat_maps(_pixels(batch), rows, path, f"Where position and orientation look, {_where(trained[0].data)}")
+    return [path]
+
+
+def _features(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
+    """Principal components of the position branch's features, a row a system."""
+    batch, rows = _same_frames(trained, frames), []
+    for each in trained:
+        feats_BCHW = position_features(each.system.network, batch.image)
+        rows.append((_beside(each), [principal_colors(feats, each.data.crop).numpy() for feats in feats_BCHW]))
+    path, title = out / "features.png", f"Principal components of the position branch, {_where(trained[0].data)}"
+    with _writing(out):
+        draw_features(_pixels(batch), rows, path, title)
+    return [path]
+
+
+def _curves(name: str, draw: Callable[[Sequence[Trained], Path, str], None]) -> Callable[..., list[Path]]:
+    """A figure of curves, all systems on it."""
+
+    def write(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
+        for each in trained:
+            each.data.setup("test")
+            _check_same_frames(each, trained[0])
+        path = out / f"{name}.png"
+        with _writing(out):
+            draw(trained, path, _where(trained[0].data))
+        return [path]
+
+    return write
+
+
+FIGURES: dict[str, Callable[[Sequence[Trained], Path, int], list[Path]]] = {
+    "trajectory": _trajectory,
+    "heatmaps": _heatmaps,
+    "features": _features,
+    "cumulative": _curves("cumulative", draw_cumulative),
+    "time": _curves("time", draw_time),
+    "sparsity": _curves("sparsity", draw_sparsity),
+}
+"""Each kind of figure: it takes the systems, a folder that is there, and how many frames to show."""
+
+
+def _same_frames(trained: Sequence[Trained], count: int) -> PoseBatch:
+    """Evenly spaced test frames, cropped, that all the systems are to be looked at on."""
+    first = trained[0]
+    for each in trained:
+        each.data.setup("test")
+        if each.data.crop != first.data.crop:
+            sizes = f"{each.data.crop}, but {first.checkpoint} {first.data.crop}"
+            raise InputError(f"{each.checkpoint}: sees images of {sizes}; draw systems of one image size together")
+        _check_same_frames(each, first)
+    total = len(first.data.frames("test"))
+    if count > total:
+        raise InputError(f"--frames {count}: there are {total} test frames; give at most so many")
+    rows = ((np.arange(count) + 0.5) * total / count).astype(int).tolist()
+    batch = first.data.test_dataloader().dataset.__getitems__(rows)  # type: ignore[attr-defined]
+    return first.data.on_after_batch_transfer(batch, 0)
+
+
+def _check_same_frames(trained: Trained, first: Trained) -> None:
+    if _test_fingerprint(trained) != _test_fingerprint(first):
+        raise InputError(
+            f"{trained.checkpoint}: sees other test frames than {first.checkpoint}; draw systems of one scene "
+            "together, or give them one with --data.scene"
+        )
+
+
+def _test_fingerprint(trained: Trained) -> str:
+    return trained.data.describe()["fingerprints"]["test"]
+
+
+def _pixels(batch: PoseBatch) -> np.ndarray:
+    return batch.image.movedim(1, -1).numpy()
+
+
+def _beside(trained: Trained) -> str:
+    """A row's label, in short lines."""
+    return f"{trained.name.replace(' ', chr(10), 1)}\n{trained.run}"
+
+
+def _where(data: PoseDataModule) -> str:
+    told = data.describe()
+    split = "official split" if told["official_split"] else "not an official benchmark split"
+    return f"{told['dataset']}/{told['scene']}, test{' (rendered)' if told['rendered'] else ''}, {split}"
+
+
+@contextmanager
+def _writing(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another folder with --out") from None
