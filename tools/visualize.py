@@ -23,7 +23,7 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv, defaults=False)
     trained = [_trained(parser, argv, checkpoint) for checkpoint in args.checkpoints]
     first = args.checkpoints[0]
-    out = args.out or first.parent.parent / "figures" / first.stem
+    out = args.get("out") or first.parent.parent / "figures" / first.stem
     for path in draw_figures(args.kind, trained, out, args.get("frames", 3)):
         print(path)
 

@@ -1,0 +1,128 @@
+"""Every kind of figure of real, tiny trainings, and the tool used wrongly."""
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from mambaloc.evaluation.figures import FIGURES
+from mambaloc.metrics import PoseErrors
+from mambaloc.types import PoseBatch, PosePrediction
+from mambaloc.viz import draw_top_view, write_scene_page
+from mambaloc.viz.top_view import horizontal_axes
+
+TOOLS = Path(__file__).parents[2] / "tools"
+
+
+def tool(name, *words):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [name, *map(str, words)])
+        runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
+
+
+def train(folder, scenes, gis="none", scene="heads", image_size=64):
+    arguments = {"backbone": "resnet10t", "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "gis": gis}
+    content = {
+        "model": {"class_path": "LitTransPoseNet", "init_args": {**arguments, "head_hidden": 16}},
+        "data": {
+            **{"root": str(scenes), "scene": scene, "image_size": image_size, "short_side": 72},
+            **{"validation": "test_set", "batch_size": 8},
+        },
+        "trainer": {"max_epochs": 2, "accelerator": "cpu", "default_root_dir": str(folder)},
+        "best_checkpoint": {"save_top_k": 0},
+        "onnx_export": {"enabled": False},
+    }
+    recipe = folder.with_suffix(".yaml")
+    recipe.write_text(yaml.safe_dump(content))
+    tool("train", recipe)
+    return folder / "checkpoints/last.ckpt"
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory, scenes):
+    folder = tmp_path_factory.mktemp("runs")
+    return [train(folder / gis, scenes, gis) for gis in ("none", "gis")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FIGURES)
+def test_every_kind_is_drawn(kind, checkpoints, tmp_path, capsys):
+    tool("visualize", kind, *checkpoints, "--out", tmp_path, "--frames", 2)
+    written = [Path(line) for line in capsys.readouterr().out.splitlines() if line.startswith(str(tmp_path))]
+    assert sorted(written) == sorted(tmp_path.iterdir())
+    pictures = [cv2.imread(str(path)) for path in written if path.suffix == ".png"]
+    assert len(pictures) == (2 if kind == "trajectory" else 1)
+    assert all(min(picture.shape[:2]) > 200 and picture.std() > 5 for picture in pictures)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        (["portrait", "CHECKPOINT"], "portrait"),
+        (["heatmaps", "nothing.ckpt"], "nothing.ckpt: no such checkpoint"),
+        (["heatmaps", "CHECKPOINT", "--frames", "0"], "--frames 0: give 1 to"),
+        (["features", "CHECKPOINT", "--frames", "9"], "there are 8 test frames"),
+        (["heatmaps", "CHECKPOINT", "OTHER"], "draw systems of one image size together"),
+        (["time", "STUDENT"], "was not validated"),
+        (["cumulative", "CHECKPOINT", "--out", "FILE"], "cannot be written"),
+    ],
+)
+def test_visualize_used_wrong(words, rule, checkpoints, scenes, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    named = {"CHECKPOINT": checkpoints[0], "FILE": tmp_path / "file"}
+    if "OTHER" in words:
+        named["OTHER"] = train(tmp_path / "other", scenes, image_size=48)
+    if "STUDENT" in words:
+        named["STUDENT"] = train_unwatched(checkpoints[0], tmp_path)
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        tool("visualize", *(named.get(word, word) for word in words))
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert rule in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def train_unwatched(checkpoint, folder):
+    recipe = checkpoint.parent.parent.with_suffix(".yaml")
+    tool("train", recipe, "--data.validation", "none", "--trainer.default_root_dir", folder / "unwatched")
+    return folder / "unwatched/checkpoints/last.ckpt"
+
+
+@pytest.fixture
+def table():
+    """Two outdoor sequences whose y points up, predicted a metre off."""
+    rng = np.random.default_rng(0)
+    true_m = torch.from_numpy(rng.normal(0, (20, 0.3, 40), (12, 3))).float()
+    quaternion = torch.tensor([[1.0, 0, 0, 0]]).expand(12, -1)
+    errors = PoseErrors()
+    batch = PoseBatch(torch.zeros(12, 3, 2, 2), true_m, quaternion, torch.arange(12))
+    errors.update(PosePrediction(true_m + torch.tensor([1.0, 0, 0]), quaternion), batch)
+    return errors.table()
+
+
+def test_the_top_view_leaves_out_the_axis_that_points_up(table, tmp_path):
+    assert horizontal_axes(table.true_position_m.numpy()) == (0, 2)
+    assert horizontal_axes(table.true_position_m.numpy()[:, [0, 2, 1]]) == (0, 1)
+    draw_top_view(table, ["seq1"] * 6 + ["seq2"] * 6, tmp_path / "view.png", "a place")
+    picture = cv2.imread(str(tmp_path / "view.png"))
+    blue, green, red = (picture[..., channel].astype(int) for channel in range(3))
+    assert ((red - green > 100) & (red - blue > 100)).sum() > 100  # predictions
+    assert (picture.max(-1) < 40).sum() > 100  # the true path
+
+
+def test_the_page_names_every_frame_and_fetches_nothing(table, tmp_path):
+    names = [f"seq1/<frame>{i:03d}.png" for i in range(12)]
+    write_scene_page(table, ["seq1"] * 6 + ["seq2"] * 6, names, tmp_path / "page.html", "a <place>\nrendered")
+    page = (tmp_path / "page.html").read_text()
+    assert all(f"frame\\u003e{i:03d}.png" in page or f"frame&gt;{i:03d}.png" in page for i in range(12))
+    assert "<h1>a &lt;place&gt;</h1>" in page
+    assert "median 1.000 m, 0.00°; mean 1.000 m, 0.00°; 12 frames" in page
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", page)
