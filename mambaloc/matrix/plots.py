@@ -48,7 +48,9 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
         plots.append(Plot("Errors and training frames", text, figure))
     if all(history(cell) for row in rows for cell in row.cells):
         text = f"Median position errors while training on {most} frames, a line a seed; dashed: retrieval."
-        figure = _panels(full, lambda axes, group: _by_time(axes, group, series), "training time (s)", _ERROR)
+        figure = _panels(
+            full, lambda axes, group: _by_time(axes, group, series), "training time (s)", _ERROR, sharex=False
+        )
         plots.append(Plot("Errors and training time", text, figure))
     text = f"Share of test frames whose position error is at most so large; trained on {most}, all seeds together."
     figure = _panels(full, lambda axes, group: _cumulative(axes, group, series), _ERROR, "share of frames")
@@ -76,11 +78,13 @@ def _dots(rows: Sequence[Row], series: str | None) -> Figure:
     return figure
 
 
-def _panels(groups: dict[str, list[Row]], draw: Callable[[Axes, list[Row]], None], x: str, y: str) -> Figure:
+def _panels(
+    groups: dict[str, list[Row]], draw: Callable[[Axes, list[Row]], None], x: str, y: str, sharex: bool = True
+) -> Figure:
     lines = -(-len(groups) // _COLUMNS)
     columns = min(_COLUMNS, len(groups))
     figure = Figure(figsize=(0.4 + 3.2 * columns, 0.6 + 2.1 * lines), layout="constrained")
-    every = np.ravel(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False))
+    every = np.ravel(figure.subplots(lines, columns, sharex=sharex, sharey=True, squeeze=False))
     for axes, (name, group) in zip(every, groups.items(), strict=False):
         draw(axes, group)
         axes.set_title(name, fontsize=10, loc="left")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import mean, stdev
+from statistics import geometric_mean, mean, stdev
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import BLOCK, LEVEL
@@ -113,8 +113,8 @@ def _compared(name: str, axis: str, before: str, after: str, found: Sequence[Dif
         return Section(name, title, "Never run both.")
     text = (
         "Differences of medians on the same frames, negative where it helps. Seconds a step: after to before. Steps to "
-        "the same error: to the worse of a pair's two last errors, below 1 where it is reached sooner. Both with the "
-        "range of the pairs."
+        "the same error: to the worse of a pair's two last errors, below 1 where it is reached sooner. Both are "
+        "geometric means, with the range of the pairs."
     )
     titles = [NAMES[error].replace("median", "difference of") for error in ERRORS]
     table = [[*found[0].labels, *titles, "seconds a step", "steps to the same error"]]
@@ -176,7 +176,7 @@ def _signed(figure: Figure) -> str:
 def _ratio(values: Sequence[float]) -> str:
     if not values:
         return ""
-    return f"{mean(values):.2f}" + (f" ({min(values):.2f} to {max(values):.2f})" if len(values) > 1 else "")
+    return f"{geometric_mean(values):.2f}" + (f" ({min(values):.2f} to {max(values):.2f})" if len(values) > 1 else "")
 
 
 def _spread(values: Sequence[float], digits: int) -> str:
