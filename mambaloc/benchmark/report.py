@@ -121,8 +121,9 @@ def print_scenes(scenes: Sequence[SceneCost], machine: str) -> None:
     }.items():
         if which:
             console.print(f"{said}: {', '.join(which)}", soft_wrap=True)
-    console.print("decode: once, ever; open: from the cache, each run. Memory: the most while loading, with the")
-    console.print(f"cache's mapped pages, less that of the process before. {machine}", soft_wrap=True)
+    console.print("decode: once, ever; open: from the cache, each run. Memory: the most while loading, the")
+    console.print("cache's mapped pages included, less that of the process before it.")
+    console.print(machine, soft_wrap=True)
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rich.console import Console
 from rich.progress import track
 
 from mambaloc.data import PoseDataModule
@@ -80,7 +81,7 @@ def measure_scenes(dataset: str, root: Path, scenes: Sequence[str], short_side: 
     kept.mkdir(parents=True, exist_ok=True)
     spawn = multiprocessing.get_context("spawn")  # a fork would begin with this process's memory
     found = []
-    for name in track(names, "Loading scenes", transient=True):
+    for name in track(names, "Loading scenes", console=Console(stderr=True), transient=True):
         with ProcessPoolExecutor(1, mp_context=spawn) as pool, TemporaryDirectory(dir=kept) as cache:
             found.append(pool.submit(_measure, dataset, root, name, short_side, cache).result())
     return found
