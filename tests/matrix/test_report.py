@@ -118,6 +118,19 @@ def test_differences_are_paired_by_seed_and_frame(store):
         differences(Store.ended(folder).values(), "gis", "none", "classical")
 
 
+def test_differences_over_scenes_resample_each_by_itself(tmp_path):
+    hard = np.random.default_rng(0).gamma(4, 0.1, FRAMES)
+    told = {}
+    for scene, count, gain_m in (("heads", FRAMES, 0.2), ("stairs", 25, 0.1)):
+        for gis, errors in (("none", hard[:count] + gain_m), ("gis", hard[:count])):
+            told[scene, gis, "0"] = result("posenet", gis, errors, scene=scene)
+            told[scene, gis, "0"]["frames"]["image"] = told[scene, gis, "0"]["frames"]["image"][:count]
+    found = differences(Store.ended(stored(tmp_path / "results", told)).values(), "gis", "none", "gis")
+    assert [each.labels["system"] for each in found] == ["heads", "stairs", "all"]
+    overall = found[-1].errors["position_error_m"]
+    assert (overall.mean, overall.low, overall.high) == pytest.approx((-0.15, -0.15, -0.15))
+
+
 class Tables(HTMLParser):
     """Text of every table's cells."""
 
