@@ -40,23 +40,29 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
     by_system: dict[str, list[Row]] = {}
     for row in rows:
         by_system.setdefault(row.labels[first], []).append(row)
-    most = max(row.train_frames for row in rows)
-    full = {name: of for name, group in by_system.items() if (of := [r for r in group if r.train_frames == most])}
-    if len({row.train_frames for row in rows}) > 1:
+    full = {name: _on_most_frames(group) for name, group in by_system.items()}
+    if any(len(full[name]) < len(group) for name, group in by_system.items()):
         text = "Median position errors against the number of training frames; dashed: retrieval among the same frames."
         figure = _panels(by_system, lambda axes, group: _by_frames(axes, group, series), "training frames", _ERROR)
         plots.append(Plot("Errors and training frames", text, figure))
     if all(history(cell) for row in rows for cell in row.cells):
-        text = f"Median position errors while training on {most} frames, a line a seed; dashed: retrieval."
+        text = "Median position errors while training on the most frames, a line a seed; dashed: retrieval."
         figure = _panels(
             full, lambda axes, group: _by_time(axes, group, series), "training time (s)", _ERROR, sharex=False
         )
         plots.append(Plot("Errors and training time", text, figure))
-    text = f"Share of test frames whose position error is at most so large; trained on {most}, all seeds together."
+    text = (
+        "Share of test frames whose position error is at most so large; trained on the most frames, all seeds together."
+    )
     figure = _panels(full, lambda axes, group: _cumulative(axes, group, series), _ERROR, "share of frames")
     told = (np.array(cell["frames"][_POSITION]) for group in full.values() for row in group for cell in row.cells)
     figure.axes[0].set(xlim=(0, most_shown(told)), ylim=(0, 1))
     return [*plots, Plot("Errors frame by frame", text, figure)]
+
+
+def _on_most_frames(group: list[Row]) -> list[Row]:
+    most = max(row.train_frames for row in group)
+    return [row for row in group if row.train_frames == most]
 
 
 def _dots(rows: Sequence[Row], series: str | None) -> Figure:
