@@ -52,7 +52,7 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
         )
         plots.append(Plot("Errors and training time", text, figure))
     text = (
-        "Share of test frames whose position error is at most so large; trained on the most frames, all seeds together."
+        "Share of test frames whose position error is at most so large; trained on the most frames, all seeds."
     )
     figure = _panels(full, lambda axes, group: _cumulative(axes, group, series), _ERROR, "share of frames")
     told = (np.array(cell["frames"][_POSITION]) for group in full.values() for row in group for cell in row.cells)
