@@ -121,7 +121,8 @@ def _heatmaps(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
         rows.append(BranchHeat(_beside(each), *maps, errors_m, errors_deg))
     path = out / "heatmaps.png"
     with _writing(out):
-        draw_heat_maps(_pixels(batch), rows, path, f"Where position and orientation look, {_where(trained[0].data)}")
+        title = f"Where position and orientation look (Grad-CAM)\n{_where(trained[0].data)}"
+        draw_heat_maps(_pixels(batch), rows, path, title)
     return [path]
 
 
@@ -131,7 +132,7 @@ def _features(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
     for each in trained:
         feats_BCHW = position_features(each.system.network, batch.image)
         rows.append((_beside(each), [principal_colors(feats, each.data.crop).numpy() for feats in feats_BCHW]))
-    path, title = out / "features.png", f"Principal components of the position branch, {_where(trained[0].data)}"
+    path, title = out / "features.png", f"Principal components of the position branch\n{_where(trained[0].data)}"
     with _writing(out):
         draw_features(_pixels(batch), rows, path, title)
     return [path]

@@ -51,9 +51,7 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
             full, lambda axes, group: _by_time(axes, group, series), "training time (s)", _ERROR, sharex=False
         )
         plots.append(Plot("Errors and training time", text, figure))
-    text = (
-        "Share of test frames whose position error is at most so large; trained on the most frames, all seeds."
-    )
+    text = "Share of test frames whose position error is at most so large; trained on the most frames, all seeds."
     figure = _panels(full, lambda axes, group: _cumulative(axes, group, series), _ERROR, "share of frames")
     told = (np.array(cell["frames"][_POSITION]) for group in full.values() for row in group for cell in row.cells)
     figure.axes[0].set(xlim=(0, most_shown(told)), ylim=(0, 1))

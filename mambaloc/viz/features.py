@@ -9,6 +9,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -92,12 +93,12 @@ def draw_features(
     """
     count, height, width = images.shape[:3]
     size_in = (count * _CELL_IN + 0.5, (1 + len(rows)) * (_CELL_IN * height / width + 0.06) + 0.5)
-    figure = Figure(figsize=size_in, layout="compressed")
+    figure = Figure(figsize=size_in, layout=ConstrainedLayoutEngine(compress=True, w_pad=0.02, h_pad=0.02, hspace=0))
     cells = figure.subplots(1 + len(rows), count, squeeze=False)
     for line, (label, pictures) in enumerate((("", list(images)), *rows)):
         cells[line, 0].set_ylabel(label, fontsize=9)
         for axes, picture in zip(cells[line], pictures, strict=True):
-            axes.imshow(picture)
+            axes.imshow(picture, interpolation="bilinear")
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
     figure.suptitle(title, fontsize=11)

@@ -116,7 +116,7 @@ def draw_heat_maps(images: NDArray[Any], rows: Sequence[BranchHeat], path: Path,
     figure = Figure(figsize=(2 * count * _CELL_IN + 1, (2 + len(rows)) * (cell_in + 0.25) + 0.6), layout="compressed")
     grid = figure.add_gridspec(1 + len(rows), 2 * count, height_ratios=(2, *[1] * len(rows)))
     for column, image in enumerate(images):
-        _bare(figure.add_subplot(grid[0, 2 * column : 2 * column + 2])).imshow(image)
+        _bare(figure.add_subplot(grid[0, 2 * column : 2 * column + 2])).imshow(image, interpolation="bilinear")
     for line, row in enumerate(rows, start=1):
         told_m, told_deg = row.position_error_m.tolist(), row.rotation_error_deg.tolist()
         for column, image in enumerate(images):
@@ -141,7 +141,7 @@ def _bare(axes: Axes) -> Axes:
 def _overlay(axes: Axes, image: NDArray[Any], heat_HW: Tensor) -> None:
     """Lay a map over its frame, in grey so that colour is heat alone."""
     smooth = F.interpolate(heat_HW[None, None], image.shape[:2], mode="bicubic").clamp(0, 1)[0, 0].cpu().numpy()
-    axes.imshow(image.mean(-1), cmap="gray", vmin=0, vmax=1)
+    axes.imshow(image.mean(-1), cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
     axes.imshow(smooth, cmap="turbo", vmin=0, vmax=1, alpha=0.5)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mambaloc.errors import InputError
 from mambaloc.geometry import matrix_from_quaternion
 from mambaloc.metrics import PoseErrorTable
-from mambaloc.viz.trajectory import TRUE_COLOR, means, medians
+from mambaloc.viz.trajectory import TRUE_COLOR, box_around, means, medians
 
 _REDS = ((0.0, "#fb9272"), (0.5, "#d7301f"), (1.0, "#67000d"))
 
@@ -43,11 +43,9 @@ def write_scene_page(
     index = table.index.tolist()
     ours, theirs = [names[i] for i in index], [sequences[i] for i in index]
     figure = Figure(data=[_offsets(table), _true_path(table, theirs, ours), _predictions(table, ours)])
-    axes = {f"{name}axis": {"title": f"{name} [m]", "backgroundcolor": "#f6f7f8"} for name in "xyz"}
-    view = {"aspectmode": "data", "dragmode": "orbit", "camera": _camera(table), **axes}
     figure.update_layout(
         template="plotly_white",
-        scene=view,
+        scene=_view(table),
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         legend={"x": 0.01, "y": 0.99, "itemsizing": "constant"},
         hoverlabel={"bgcolor": "white"},
@@ -116,15 +114,25 @@ def _coordinates(position_m: NDArray[np.floating]) -> dict[str, NDArray[np.float
     return dict(zip("xyz", position_m.T, strict=True))
 
 
-def _camera(table: PoseErrorTable) -> dict[str, Any]:
-    """Look down on the scene from a corner: up is the world's axis that the cameras' own up is nearest to."""
+def _view(table: PoseErrorTable) -> dict[str, Any]:
+    """Axes of one scale, whose longest side is 1, and where they are first seen from.
+
+    Up is the world's axis that the cameras' own up is nearest to, and the longer of the other two runs across.
+    """
+    limits_m = box_around(table)
+    sides = np.ptp(limits_m, axis=1) / np.ptp(limits_m, axis=1).max()
     up = -matrix_from_quaternion(table.true_quaternion.cpu())[..., 1].mean(0).numpy()  # a camera's y points down
-    axis = int(np.abs(up).argmax())
-    towards = np.ones(3)
-    towards[axis] = 0.8 * np.sign(up[axis])
-    vector = np.zeros(3)
-    vector[axis] = np.sign(up[axis])
-    return {"up": _xyz(vector), "eye": _xyz(1.8 * towards)}
+    vertical = int(np.abs(up).argmax())
+    deep, across = sorted({0, 1, 2} - {vertical}, key=lambda axis: sides[axis])
+    above, eye = np.zeros(3), np.zeros(3)
+    above[vertical] = np.sign(up[vertical])
+    eye[[across, deep, vertical]] = 0.5, 1.3, 0.7 * above[vertical]
+    axes = {
+        f"{name}axis": {"title": {"text": f"{name} [m]"}, "range": limits.tolist(), "backgroundcolor": "#f6f7f8"}
+        for name, limits in zip("xyz", limits_m, strict=True)
+    }
+    camera = {"up": _xyz(above), "eye": _xyz(eye), "center": _xyz(-0.08 * above)}
+    return {"aspectmode": "manual", "aspectratio": _xyz(sides), "dragmode": "orbit", "camera": camera, **axes}
 
 
 def _xyz(vector: NDArray[np.floating]) -> dict[str, float]:

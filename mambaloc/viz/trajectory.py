@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from mambaloc.metrics import PoseErrorTable, summarise
 
@@ -39,9 +41,7 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
     axes.plot([], [], color=TRUE_COLOR, linewidth=1.8, label="ground truth")
     axes.scatter([], [], [], color=PREDICTED_COLOR, s=7, label="prediction")
     axes.legend(loc="upper right", frameon=False)
-    low_m, high_m = np.vstack((true_m, predicted_m)).min(0), np.vstack((true_m, predicted_m)).max(0)
-    half_m = np.maximum((high_m - low_m) / 2, 0.25 * (high_m - low_m).max())  # a flat path still gets a box to lie in
-    limits_m = np.stack(((low_m + high_m) / 2 - half_m, (low_m + high_m) / 2 + half_m), axis=1)
+    limits_m = box_around(table)
     axes.set(xlim=limits_m[0], ylim=limits_m[1], zlim=limits_m[2])
     for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", strict=True):
         axis.set_major_locator(MaxNLocator(5))
@@ -49,7 +49,7 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
         axis.labelpad = 8
     axes.set_aspect("equal")
 
-    axes.set_title(f"{title}\n{medians(table)} over {len(table.index)} frames")
+    figure.suptitle(f"{title}\n{medians(table)} over {len(table.index)} frames", fontsize=12)
     bar = figure.add_subplot(grid[1])
     errors_deg = table.rotation_error_deg.cpu().numpy()
     top = round(max(1.0, float(np.percentile(errors_deg, 95))), 1)
@@ -57,6 +57,14 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
     bar.set(yticks=[], xlabel="frame")
     figure.colorbar(image, ax=bar, label="rotation\nerror [°]", extend="max", ticks=[0, top], aspect=4)
     write_png(figure, path)
+
+
+def box_around(table: PoseErrorTable) -> NDArray[np.floating]:
+    """Where a plot of a split begins and ends along each axis: (3, 2), in metres."""
+    both_m = torch.cat((table.true_position_m, table.predicted_position_m)).cpu().numpy()
+    low_m, high_m = both_m.min(0), both_m.max(0)
+    half_m = np.maximum((high_m - low_m) / 2, 0.25 * (high_m - low_m).max())  # a flat path still gets a box to lie in
+    return np.stack(((low_m + high_m) / 2 - half_m, (low_m + high_m) / 2 + half_m), axis=1)
 
 
 def medians(table: PoseErrorTable) -> str:

@@ -257,6 +257,26 @@ def test_two_workers_of_a_local_ray(folder, monkeypatch):
     assert sorted(tried(folder)) == ["r.yaml --a", "r.yaml --b", "r.yaml --c"]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems leave orphans to themselves")
+def test_a_killed_supervisor_takes_its_training_along(tmp_path):
+    told = tmp_path / "pid"
+    sleep = f"import os, time, pathlib; pathlib.Path({str(told)!r}).write_text(str(os.getpid())); time.sleep(60)"
+    words = [sys.executable, str(running._SUPERVISOR), sys.executable, "-c", sleep]
+    supervisor = subprocess.Popen(words, stdin=subprocess.PIPE, start_new_session=True)
+    wait_for(lambda: told.is_file() and told.read_text())
+    supervisor.kill()
+    supervisor.communicate()
+    process = Path("/proc", told.read_text(), "stat")
+    wait_for(lambda: not process.is_file() or process.read_text().rpartition(")")[2].split()[0] == "Z")
+
+
+def wait_for(happens, seconds=10):
+    until = time.monotonic() + seconds
+    while not happens():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
 def test_a_real_training_is_a_cell(scenes, tiny_recipe, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "find_spec", lambda name: None)
     axes = {"system": {"mambaloc": [str(tiny_recipe), "--trainer.max_epochs", 1]}}
