@@ -206,7 +206,7 @@ class LitPoseRegressor(L.LightningModule):
             "device": provenance.device_name(self.device.index if self.device.type == "cuda" else None),
             "seed": provenance.seed(),
         }
-        if isinstance(data := getattr(self.trainer, "datamodule", None), PoseDataModule):
+        if isinstance(data := getattr(self._trainer, "datamodule", None), PoseDataModule):  # saved outside a fit, too
             checkpoint["mambaloc"]["data"] = data.describe()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
