@@ -102,4 +102,4 @@ def draw_features(
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
     figure.suptitle(title, fontsize=11)
-    write_png(figure, path, dpi=140, margin_in=0.1)
+    write_png(figure, path)

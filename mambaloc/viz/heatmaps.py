@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from timm.layers import SelectAdaptivePool2d
@@ -26,6 +28,7 @@ from mambaloc.nn import Backbone, PoseNetwork
 from mambaloc.viz.trajectory import write_png
 
 _CELL_IN = 1.6
+_COLORS = "turbo"
 
 
 class Reading(NamedTuple):
@@ -128,8 +131,11 @@ def draw_heat_maps(images: NDArray[Any], rows: Sequence[BranchHeat], path: Path,
             axes[1].set_title(f"{head[1]}{told_deg[column]:.1f}°", fontsize=9)
             if column == 0:
                 axes[0].set_ylabel(row.label, fontsize=9)
+    heat = ScalarMappable(Normalize(0, 1), _COLORS)
+    bar = figure.colorbar(heat, ax=figure.axes, location="right", fraction=0.02, pad=0.02, aspect=40, ticks=[0, 1])
+    bar.set_label("heat, over each map's largest", fontsize=9)
     figure.suptitle(title, fontsize=11)
-    write_png(figure, path, dpi=140, margin_in=0.1)
+    write_png(figure, path)
 
 
 def _bare(axes: Axes) -> Axes:
@@ -142,7 +148,7 @@ def _overlay(axes: Axes, image: NDArray[Any], heat_HW: Tensor) -> None:
     """Lay a map over its frame, in grey so that colour is heat alone."""
     smooth = F.interpolate(heat_HW[None, None], image.shape[:2], mode="bicubic").clamp(0, 1)[0, 0].cpu().numpy()
     axes.imshow(image.mean(-1), cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
-    axes.imshow(smooth, cmap="turbo", vmin=0, vmax=1, alpha=0.5)
+    axes.imshow(smooth, cmap=_COLORS, vmin=0, vmax=1, alpha=0.5)
 
 
 @contextmanager

@@ -16,6 +16,12 @@ from mambaloc.geometry import matrix_from_quaternion
 from mambaloc.metrics import PoseErrorTable
 from mambaloc.viz.trajectory import TRUE_COLOR, box_around, means, medians
 
+_CONFIG = {
+    "displaylogo": False,
+    "responsive": True,
+    "showSendToCloud": False,  # plotly 7 shows a button that uploads the chart unless told not to
+    "plotlyServerURL": "",
+}
 _REDS = ((0.0, "#fb9272"), (0.5, "#d7301f"), (1.0, "#67000d"))
 
 
@@ -42,7 +48,8 @@ def write_scene_page(
         raise InputError(f"{path.name}: is drawn by plotly, which is missing; pip install 'mambaloc[viz]'") from None
     index = table.index.tolist()
     ours, theirs = [names[i] for i in index], [sequences[i] for i in index]
-    figure = Figure(data=[_offsets(table), _true_path(table, theirs, ours), _predictions(table, ours)])
+    told = _told(ours, table.position_error_m.tolist(), table.rotation_error_deg.tolist())
+    figure = Figure(data=[_offsets(table, told), _true_path(table, theirs, ours), _predictions(table, told)])
     figure.update_layout(
         template="plotly_white",
         scene=_view(table),
@@ -51,11 +58,10 @@ def write_scene_page(
         hoverlabel={"bgcolor": "white"},
         font={"family": "system-ui, sans-serif", "size": 13},
     )
-    plot = figure.to_html(full_html=False, include_plotlyjs=True, config={"displaylogo": False, "responsive": True})
+    plot = figure.to_html(full_html=False, include_plotlyjs=True, config=_CONFIG)
     summary = f"{medians(table)}; {means(table)}; {len(index)} frames"
     heading, *details = title.split("\n")
-    told = {"title": heading, "summary": "; ".join((*details, summary))}
-    page = _PAGE.substitute({name: html.escape(text) for name, text in told.items()}, plot=plot)
+    page = _PAGE.substitute(title=html.escape(heading), summary=html.escape("; ".join((*details, summary))), plot=plot)
     partial = path.with_name(f".{path.name}.partial")
     partial.write_text(page, encoding="utf-8")
     partial.replace(path)
@@ -79,7 +85,7 @@ def _true_path(table: PoseErrorTable, sequences: Sequence[str], names: Sequence[
     )
 
 
-def _predictions(table: PoseErrorTable, names: Sequence[str]) -> Any:
+def _predictions(table: PoseErrorTable, told: Sequence[str]) -> Any:
     from plotly.graph_objects import Scatter3d
 
     errors_deg = table.rotation_error_deg.cpu().numpy()
@@ -90,7 +96,7 @@ def _predictions(table: PoseErrorTable, names: Sequence[str]) -> Any:
         mode="markers",
         name="prediction",
         marker={"size": 3.5, "color": errors_deg, "cmin": 0, "cmax": top_deg, "colorscale": _REDS, "colorbar": bar},
-        text=_told(names, table.position_error_m.tolist(), errors_deg.tolist()),
+        text=told,
         hovertemplate="%{text}<extra></extra>",
     )
 
@@ -100,14 +106,21 @@ def _told(names: Sequence[str], errors_m: Iterable[float], errors_deg: Iterable[
     return [f"{html.escape(name)}<br>{error_m:.3f} m<br>{error_deg:.2f}°" for name, error_m, error_deg in rows]
 
 
-def _offsets(table: PoseErrorTable) -> Any:
-    """Thin lines from each true position to the predicted one."""
+def _offsets(table: PoseErrorTable, told: Sequence[str]) -> Any:
+    """Thin lines from each true position to the predicted one; they end in its marker, so they tell the same."""
     from plotly.graph_objects import Scatter3d
 
     true_m, predicted_m = table.true_position_m.cpu().numpy(), table.predicted_position_m.cpu().numpy()
     ends_m = np.stack((true_m, predicted_m, np.full_like(true_m, np.nan)), axis=1).reshape(-1, 3)
     line = {"color": "rgba(215, 48, 39, 0.35)", "width": 1.5}
-    return Scatter3d(**_coordinates(ends_m), mode="lines", line=line, hoverinfo="skip", showlegend=False)
+    return Scatter3d(
+        **_coordinates(ends_m),
+        mode="lines",
+        line=line,
+        showlegend=False,
+        text=np.repeat(np.array(told, dtype=object), 3).tolist(),
+        hovertemplate="%{text}<extra></extra>",
+    )
 
 
 def _coordinates(position_m: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
@@ -126,9 +139,14 @@ def _view(table: PoseErrorTable) -> dict[str, Any]:
     deep, across = sorted({0, 1, 2} - {vertical}, key=lambda axis: sides[axis])
     above, eye = np.zeros(3), np.zeros(3)
     above[vertical] = np.sign(up[vertical])
-    eye[[across, deep, vertical]] = 0.5, 1.3, 0.7 * above[vertical]
+    eye[[across, deep, vertical]] = 0.35, 0.9, 0.95 * above[vertical]
     axes = {
-        f"{name}axis": {"title": {"text": f"{name} [m]"}, "range": limits.tolist(), "backgroundcolor": "#f6f7f8"}
+        f"{name}axis": {
+            "title": {"text": f"{name} [m]"},
+            "range": limits.tolist(),
+            "backgroundcolor": "#f6f7f8",
+            "showspikes": False,
+        }
         for name, limits in zip("xyz", limits_m, strict=True)
     }
     camera = {"up": _xyz(above), "eye": _xyz(eye), "center": _xyz(-0.08 * above)}
@@ -149,7 +167,7 @@ _PAGE = Template("""<!doctype html>
   body { display: flex; flex-direction: column; font: 15px/1.4 system-ui, sans-serif; color: #1b1f24 }
   header { padding: .7rem 1rem .5rem; border-bottom: 1px solid #ddd }
   h1 { font-size: 1.15rem; margin: 0 }
-  p { margin: .15rem 0 0; color: #444 }
+  p { margin: .15rem 0 0; color: #444; font-size: .93rem }
   main { flex: 1; min-height: 0 }
   main > div { height: 100% }
 </style>

@@ -58,7 +58,7 @@ def draw_top_view(table: PoseErrorTable, sequences: Sequence[str], path: Path, t
         axis.set_major_locator(MaxNLocator(6))
     axes.set_title(f"{title}\n{medians(table)}; {means(table)}; {len(table.index)} frames", fontsize=10)
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
-    write_png(figure, path, dpi=140, margin_in=0.08)
+    write_png(figure, path)
 
 
 def horizontal_axes(position_m: NDArray[np.floating]) -> tuple[int, int]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -27,7 +26,7 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
         path: the PNG to write.
         title: heads the plot, before the medians.
     """
-    figure = Figure(figsize=(7.0, 7.4), layout="constrained")
+    figure = Figure(figsize=(7.0, 6.8), layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=(14, 1))
     axes = figure.add_subplot(grid[0], projection="3d")
     true_m, predicted_m = table.true_position_m.cpu().numpy(), table.predicted_position_m.cpu().numpy()
@@ -40,14 +39,14 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
     axes.scatter(*predicted_m.T, color=PREDICTED_COLOR, s=7, depthshade=False)
     axes.plot([], [], color=TRUE_COLOR, linewidth=1.8, label="ground truth")
     axes.scatter([], [], [], color=PREDICTED_COLOR, s=7, label="prediction")
-    axes.legend(loc="upper right", frameon=False)
+    axes.legend(loc="upper center", ncols=2, frameon=False)
     limits_m = box_around(table)
     axes.set(xlim=limits_m[0], ylim=limits_m[1], zlim=limits_m[2])
     for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", strict=True):
         axis.set_major_locator(MaxNLocator(5))
         axis.set_label_text(f"{name} [m]")
         axis.labelpad = 8
-    axes.set_aspect("equal")
+    axes.set_box_aspect(np.ptp(limits_m, axis=1), zoom=1.08)
 
     figure.suptitle(f"{title}\n{medians(table)} over {len(table.index)} frames", fontsize=12)
     bar = figure.add_subplot(grid[1])
@@ -79,16 +78,15 @@ def means(table: PoseErrorTable) -> str:
     return f"mean {summary['position_error_mean_m']:.3f} m, {summary['rotation_error_mean_deg']:.2f}°"
 
 
-def write_png(figure: Figure, path: Path, dpi: int = 100, margin_in: float | None = None) -> None:
+def write_png(figure: Figure, path: Path, dpi: int = 140, margin_in: float = 0.1) -> None:
     """Write a figure beside its place, and move it there whole.
 
     Args:
         figure: what was drawn.
         path: the PNG.
         dpi: pixels an inch.
-        margin_in: cut the figure to what is on it and this many inches around; None keeps its size.
+        margin_in: inches left around what is on the figure.
     """
     partial = path.with_name(f".{path.name}.partial")
-    box: Literal["tight"] | None = None if margin_in is None else "tight"
-    FigureCanvasAgg(figure).print_figure(partial, format="png", dpi=dpi, bbox_inches=box, pad_inches=margin_in)
+    FigureCanvasAgg(figure).print_figure(partial, format="png", dpi=dpi, bbox_inches="tight", pad_inches=margin_in)
     partial.replace(path)

@@ -2,6 +2,7 @@
 
 import re
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 import yaml
 
+from mambaloc.errors import InputError
 from mambaloc.evaluation.figures import FIGURES
 from mambaloc.metrics import PoseErrors
 from mambaloc.types import PoseBatch, PosePrediction
@@ -70,6 +72,7 @@ def test_every_kind_is_drawn(kind, checkpoints, tmp_path, capsys):
         (["heatmaps", "CHECKPOINT", "--frames", "0"], "--frames 0: give 1 to"),
         (["features", "CHECKPOINT", "--frames", "9"], "there are 8 test frames"),
         (["heatmaps", "CHECKPOINT", "OTHER"], "draw systems of one image size together"),
+        (["heatmaps", "CHECKPOINT", "ELSEWHERE"], "sees other test frames"),
         (["time", "STUDENT"], "was not validated"),
         (["cumulative", "CHECKPOINT", "--out", "FILE"], "cannot be written"),
     ],
@@ -79,6 +82,8 @@ def test_visualize_used_wrong(words, rule, checkpoints, scenes, tmp_path, capsys
     named = {"CHECKPOINT": checkpoints[0], "FILE": tmp_path / "file"}
     if "OTHER" in words:
         named["OTHER"] = train(tmp_path / "other", scenes, image_size=48)
+    if "ELSEWHERE" in words:
+        named["ELSEWHERE"] = moved(checkpoints[0], scenes, tmp_path)
     if "STUDENT" in words:
         named["STUDENT"] = train_unwatched(checkpoints[0], tmp_path)
     capsys.readouterr()
@@ -88,6 +93,16 @@ def test_visualize_used_wrong(words, rule, checkpoints, scenes, tmp_path, capsys
     error = capsys.readouterr().err
     assert rule in error
     assert len(error.strip().splitlines()) == 1
+
+
+def moved(checkpoint, scenes, folder):
+    """The same training, as if of a scene that tests on another sequence."""
+    elsewhere = shutil.copytree(scenes / "heads", folder / "scenes/heads")
+    (elsewhere / "TestSplit.txt").write_text("sequence2\n")
+    stored = torch.load(checkpoint, weights_only=True)
+    stored["datamodule_hyper_parameters"]["root"] = str(folder / "scenes")
+    torch.save(stored, folder / "moved.ckpt")
+    return folder / "moved.ckpt"
 
 
 def train_unwatched(checkpoint, folder):
@@ -126,3 +141,11 @@ def test_the_page_names_every_frame_and_fetches_nothing(table, tmp_path):
     assert "<h1>a &lt;place&gt;</h1>" in page
     assert "median 1.000 m, 0.00°; mean 1.000 m, 0.00°; 12 frames" in page
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=", page)
+    assert '"showSendToCloud": false' in page  # plotly 7 would offer to upload the chart
+
+
+def test_a_page_without_plotly_names_the_extra(table, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    with pytest.raises(InputError, match=r"pip install 'mambaloc\[viz\]'"):
+        write_scene_page(table, ["seq1"] * 12, ["frame"] * 12, tmp_path / "page.html", "a place")
+    assert not list(tmp_path.iterdir())
