@@ -41,6 +41,19 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
 
 
 @contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Tell an error of the block, which writes to a folder, in one line.
+
+    Raises:
+        InputError: where it cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder with --out") from None
+
+
+@contextmanager
 def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
     """Give an empty folder to write to, which gets its name once the block ends; an error leaves nothing.
 

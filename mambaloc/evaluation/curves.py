@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.evaluation.evaluate import localise_test_frames
-from mambaloc.evaluation.intervals import block_resamples, median_interval
-from mambaloc.metrics import PoseErrorTable
+from mambaloc.evaluation.evaluate import localise_test_frames, median_intervals, wall_clock_of
+from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models.base import read_checkpoint
 from mambaloc.viz.curves import Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
 from mambaloc.viz.trajectory import write_png
@@ -48,8 +47,8 @@ def draw_time(trained: Sequence[Trained], path: Path, title: str) -> None:
     """
     histories: dict[Path, list[dict[str, float]]] = {}
     for each in trained:
-        states = read_checkpoint(each.checkpoint)["callbacks"].items()
-        histories[each.checkpoint] = next((s["history"] for n, s in states if n.startswith("WallClock")), [])
+        clock = wall_clock_of(read_checkpoint(each.checkpoint)) or {}
+        histories[each.checkpoint] = clock.get("history", [])
         if not histories[each.checkpoint]:
             raise InputError(f"{each.checkpoint}: its training was not validated; train with data.validation")
 
@@ -60,7 +59,10 @@ def draw_time(trained: Sequence[Trained], path: Path, title: str) -> None:
             line = ([reading["train_s"] for reading in history], [reading[error] for reading in history])
             curves.setdefault(each.name, []).append(line)
         plot_errors_by_time(axes, curves)
-        axes.set(xlabel="training time (s)", ylabel=f"validation, median {_ERRORS[error]}")
+        on_test = any(each.data.hparams["validation"] == "test_set" for each in trained)
+        axes.set(
+            xlabel="training time (s)", ylabel=f"median {_ERRORS[error]}, {'TEST' if on_test else 'held-out'} frames"
+        )
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
 
@@ -75,29 +77,32 @@ def draw_sparsity(trained: Sequence[Trained], path: Path, title: str) -> None:
     Raises:
         InputError: where a checkpoint does not say how many frames it was trained on.
     """
-    tables = [(each, localise_test_frames(each.system, each.data)) for each in trained]
+    points: dict[str, dict[int, dict[str, Point]]] = {}
+    for each in trained:
+        frames, known = _training_frames(each), points.setdefault(each.name, {})
+        if frames not in known:
+            known[frames] = _points(each, frames)
 
     def draw(axes: Axes, error: str) -> None:
-        points: dict[str, list[Point]] = {}
-        for each, table in tables:
-            point = _point(each, table, error)
-            if point.frames not in {other.frames for other in points.setdefault(each.name, [])}:
-                points[each.name].append(point)
-        plot_errors_by_frames(axes, points)
+        plot_errors_by_frames(axes, {name: [told[error] for told in of.values()] for name, of in points.items()})
         axes.set(xlabel="training frames", ylabel=f"median {_ERRORS[error]}")
         axes.set_ylim(bottom=0)
 
     _write(draw, path, title)
 
 
-def _point(trained: Trained, table: PoseErrorTable, error: str) -> Point:
+def _training_frames(trained: Trained) -> int:
     data = read_checkpoint(trained.checkpoint)["mambaloc"].get("data")
     if data is None:
         raise InputError(f"{trained.checkpoint}: does not say how many frames it was trained on; train it again")
-    sequences = trained.data.frames("test").sequences
-    errors = getattr(table, error).cpu().double().numpy()
-    low, high = median_interval(errors, block_resamples([sequences[i] for i in table.index.tolist()]))
-    return Point(data["train_frames"], float(np.median(errors)), low, high)
+    return data["train_frames"]
+
+
+def _points(trained: Trained, frames: int) -> dict[str, Point]:
+    """Both medians with their intervals."""
+    table = localise_test_frames(trained.system, trained.data)
+    medians, intervals = summarise(table), median_intervals(table, trained.data.frames("test").sequences)
+    return {error: Point(frames, medians[error], *intervals[error]) for error in _ERRORS}
 
 
 def _by_name(trained: Sequence[Trained]) -> dict[str, list[Trained]]:
@@ -119,4 +124,4 @@ def _write(draw: Callable[[Axes, str], None], path: Path, title: str) -> None:
     figure.suptitle(title, fontsize=11)
     handles, names = axes.get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
-    write_png(figure, path, dpi=140)
+    write_png(figure, path)

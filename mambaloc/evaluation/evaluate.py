@@ -17,7 +17,7 @@ from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import BLOCK, LEVEL, block_resamples, median_interval
 from mambaloc.evaluation.references import frozen_features, median_training_pose, nearest_training_pose, retrieval
 from mambaloc.evaluation.trajectories import write_csv
-from mambaloc.files import sha256
+from mambaloc.files import sha256, writing
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models import LitPoseRegressor, load_checkpoint
 from mambaloc.models.base import mib, parameter_count, read_checkpoint
@@ -63,7 +63,7 @@ def evaluate_checkpoint(
         "count": len(table.index),
         "data": data.describe(),
         "split": "test",
-        "intervals": _intervals(table, data.frames("test").sequences),
+        "intervals": median_intervals(table, data.frames("test").sequences),
         "references": {**_references(data, table), **(_retrieval(backbone, data, table) if backbone else {})},
         "selection": selection_rule(stored, checkpoint),
         "model": _describe_model(system),
@@ -148,7 +148,13 @@ def _retrieval(backbone: PooledBackbone, data: PoseDataModule, table: PoseErrorT
     return retrieval(data.frames("train"), *frozen_features(backbone, data), table)
 
 
-def _intervals(table: PoseErrorTable, sequences: Sequence[str]) -> dict[str, Any]:
+def median_intervals(table: PoseErrorTable, sequences: Sequence[str]) -> dict[str, Any]:
+    """The interval of each median by bootstrap over blocks of frames, and how it was drawn.
+
+    Args:
+        table: errors of a split.
+        sequences: of the split's frames.
+    """
     rows = block_resamples([sequences[i] for i in table.index.tolist()])
     errors = {"position_error_m": table.position_error_m, "rotation_error_deg": table.rotation_error_deg}
     medians = {name: list(median_interval(each.cpu().double().numpy(), rows)) for name, each in errors.items()}
@@ -164,14 +170,18 @@ def _describe_model(system: LitPoseRegressor) -> dict[str, Any]:
     }
 
 
+def wall_clock_of(stored: dict[str, Any]) -> dict[str, Any] | None:
+    """What the wall clock of a checkpoint's training says; None where it had none."""
+    return next((state for name, state in stored["callbacks"].items() if name.startswith("WallClock")), None)
+
+
 def _describe_training(stored: dict[str, Any], checkpoint: Path) -> dict[str, Any]:
     recipe = checkpoint.parent.parent / "config.yaml"
-    clock = next((state for name, state in stored["callbacks"].items() if name.startswith("WallClock")), None)
     return {
         **stored["mambaloc"],
         "epoch": stored["epoch"] + 1,
         "step": stored["global_step"],
-        "wall_clock": clock,
+        "wall_clock": wall_clock_of(stored),
         "recipe": str(recipe) if recipe.is_file() else None,
         "recipe_sha256": sha256(recipe) if recipe.is_file() else None,
         "checkpoint": str(checkpoint),
@@ -181,7 +191,7 @@ def _describe_training(stored: dict[str, Any], checkpoint: Path) -> dict[str, An
 
 def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, data: PoseDataModule) -> None:
     frames = data.frames("test")
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         (out / "metrics.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
         write_csv(out / "predictions.csv", table, frames)
@@ -190,5 +200,3 @@ def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, data: PoseD
         chosen = result["selection"].split(":")[0]
         title = f"{result['model']['name']} on {result['data']['scene']}, test, {chosen} epoch"
         draw_trajectory(table, frames.sequences, out / "trajectory.png", title)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another folder with --out") from None

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.curves import draw_cumulative, draw_sparsity, draw_time
 from mambaloc.evaluation.evaluate import check_image_size, localise_test_frames, selection_rule
+from mambaloc.files import writing
 from mambaloc.geometry import position_error_m, rotation_error_deg
 from mambaloc.models import LitPoseRegressor, load_checkpoint
 from mambaloc.models.base import read_checkpoint
@@ -87,7 +87,7 @@ def draw_figures(kind: str, trained: Sequence[Trained], out: Path, frames: int =
     """
     if not 1 <= frames <= MOST_FRAMES:
         raise InputError(f"--frames {frames}: give 1 to {MOST_FRAMES}")
-    with _writing(out):
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)  # told now rather than once all is computed
     return FIGURES[kind](trained, out, frames)
 
@@ -102,7 +102,7 @@ def _trajectory(trained: Sequence[Trained], out: Path, frames: int) -> list[Path
         title = f"{each.name}, {each.run}\n{_where(each.data)}"
         draw = draw_top_view if each.data.hparams["dataset"] in _OUTDOORS else draw_trajectory
         names = [f"{path.parent.name}/{path.name}" for path in told.image_paths]
-        with _writing(out):
+        with writing(out):
             draw(table, told.sequences, picture, title)
             write_scene_page(table, told.sequences, names, page, title)
         written += [picture, page]
@@ -120,7 +120,7 @@ def _heatmaps(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
         maps = heat_maps(each.system.network, batch.image)
         rows.append(BranchHeat(_beside(each), *maps, errors_m, errors_deg))
     path = out / "heatmaps.png"
-    with _writing(out):
+    with writing(out):
         title = f"Where position and orientation look (Grad-CAM)\n{_where(trained[0].data)}"
         draw_heat_maps(_pixels(batch), rows, path, title)
     return [path]
@@ -133,7 +133,7 @@ def _features(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
         feats_BCHW = position_features(each.system.network, batch.image)
         rows.append((_beside(each), [principal_colors(feats, each.data.crop).numpy() for feats in feats_BCHW]))
     path, title = out / "features.png", f"Principal components of the position branch\n{_where(trained[0].data)}"
-    with _writing(out):
+    with writing(out):
         draw_features(_pixels(batch), rows, path, title)
     return [path]
 
@@ -146,7 +146,7 @@ def _curves(name: str, draw: Callable[[Sequence[Trained], Path, str], None]) -> 
             each.data.setup("test")
             _check_same_frames(each, trained[0])
         path = out / f"{name}.png"
-        with _writing(out):
+        with writing(out):
             draw(trained, path, _where(trained[0].data))
         return [path]
 
@@ -206,11 +206,3 @@ def _where(data: PoseDataModule) -> str:
     told = data.describe()
     split = "official split" if told["official_split"] else "not an official benchmark split"
     return f"{told['dataset']}/{told['scene']}, test{' (rendered)' if told['rendered'] else ''}, {split}"
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another folder with --out") from None

@@ -24,7 +24,7 @@ class Section:
         text: under the title.
         table: a header and lines of text.
         footnotes: under the table.
-        figure: a plot.
+        plot: as SVG.
         folded: on the page, shown when asked for.
     """
 
@@ -33,7 +33,7 @@ class Section:
     text: str
     table: list[list[str]] | None = None
     footnotes: list[str] = field(default_factory=list)
-    figure: Figure | None = None
+    plot: str | None = None
     folded: bool = False
 
     @property
@@ -98,7 +98,7 @@ def as_markdown(introduction: str, sections: Sequence[Section]) -> str:
         parts += [f"## {section.title}", section.text]
         if section.table:
             parts.append(_markdown_table(section.table))
-        if section.figure:
+        if section.plot:
             parts.append(f"![{section.title}](plots/{section.anchor}.svg)")
         parts.append("\n".join(f"- {note}" for note in section.footnotes))
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -122,8 +122,8 @@ def _html_section(section: Section) -> str:
     parts = [f"<p>{html.escape(section.text)}</p>"] if section.text else []
     if section.table:
         parts.append(_html_table(section.table))
-    if section.figure:
-        parts.append(f"<figure>{as_svg(section.figure)}</figure>")
+    if section.plot:
+        parts.append(f"<figure>{section.plot}</figure>")
     if section.footnotes:
         parts.append(f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in section.footnotes)}</ul>")
     title = f'<h2 id="{section.anchor}">{html.escape(section.title)}</h2>'

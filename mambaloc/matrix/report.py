@@ -52,7 +52,7 @@ def write_report(
         found = differences(cells, axis, before, after, epoch)
         sections.append(_compared(f"difference_{number + 1}", axis, before, after, found))
     plots = plots_of(rows, comparisons[0][0] if comparisons else None)
-    sections += [Section("", plot.title, plot.text, figure=plot.figure) for plot in plots]
+    sections += [Section("", plot.title, plot.text, plot=as_svg(plot.figure)) for plot in plots]
     sections += [_times(rows, reach_m), _references(rows)]
     sections += [
         Section(each.name, f"The paper's table: {each.title}", "", each.lines, each.footnotes, folded=not each.measured)
@@ -69,8 +69,8 @@ def _write(folder: Path, introduction: str, sections: Sequence[Section]) -> None
     for name in ("plots", "tables"):
         (folder / name).mkdir()
     for section in sections:
-        if section.figure:
-            (folder / "plots" / f"{section.anchor}.svg").write_text(as_svg(section.figure), encoding="utf-8")
+        if section.plot:
+            (folder / "plots" / f"{section.anchor}.svg").write_text(section.plot, encoding="utf-8")
         if section.name and section.table:
             (folder / "tables" / f"{section.name}.csv").write_text(as_csv(section.table), encoding="utf-8")
             (folder / "tables" / f"{section.name}.tex").write_text(as_latex(section), encoding="utf-8")

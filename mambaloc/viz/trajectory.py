@@ -78,15 +78,8 @@ def means(table: PoseErrorTable) -> str:
     return f"mean {summary['position_error_mean_m']:.3f} m, {summary['rotation_error_mean_deg']:.2f}°"
 
 
-def write_png(figure: Figure, path: Path, dpi: int = 140, margin_in: float = 0.1) -> None:
-    """Write a figure beside its place, and move it there whole.
-
-    Args:
-        figure: what was drawn.
-        path: the PNG.
-        dpi: pixels an inch.
-        margin_in: inches left around what is on the figure.
-    """
+def write_png(figure: Figure, path: Path) -> None:
+    """Write a figure, cut to what is on it, beside its place, and move it there whole."""
     partial = path.with_name(f".{path.name}.partial")
-    FigureCanvasAgg(figure).print_figure(partial, format="png", dpi=dpi, bbox_inches="tight", pad_inches=margin_in)
+    FigureCanvasAgg(figure).print_figure(partial, format="png", dpi=140, bbox_inches="tight", pad_inches=0.1)
     partial.replace(path)
