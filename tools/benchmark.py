@@ -1,4 +1,4 @@
-"""Measure: tools/benchmark.py sizes | latency | loading | scenes | deployment | run | report, each with --help."""
+"""Measure: tools/benchmark.py sizes|latency|loading|speed|scenes|deployment|run|report, each with --help."""
 
 import argparse
 from pathlib import Path
@@ -32,6 +32,19 @@ def _latency(args: argparse.Namespace) -> None:
 def _loading(args: argparse.Namespace) -> None:
     data = PoseDataModule(args.dataset, args.root, args.scene)
     benchmark.print_loading(benchmark.measure_loading(data), _machine())
+
+
+def _speed(args: argparse.Namespace) -> None:
+    scene = {"dataset": args.dataset, "root": args.root, "scene": args.scene, "validation": "block"}
+    setting = benchmark.Setting(model_class(args.system).registry_name, data=scene)
+    for overlay in args.overlay:
+        setting = setting.with_overlay(overlay)
+    cuda = setting.device.index if setting.device.type == "cuda" else None
+    repetitions = {"steps": args.steps, "repetitions": args.repetitions, "workers": args.workers}
+    report = benchmark.measure_all(setting, args.batches, args.frames, **repetitions)
+    benchmark.print_report(report, _machine(cuda))
+    if args.out:
+        benchmark.write_report(report, args.out, _machine(cuda))
 
 
 def _scenes(args: argparse.Namespace) -> None:
@@ -79,6 +92,18 @@ def _parser() -> argparse.ArgumentParser:
     for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
         part.add_argument(name, default=default)
     part.set_defaults(call=_loading)
+    part = parts.add_parser("speed", help="where training time goes, beside the loop of published research code")
+    part.add_argument("system", nargs="?", default="mambaloc")
+    part.add_argument("--overlay", type=Path, action="append", default=[], help="as recipes/overlays/ holds them")
+    for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
+        part.add_argument(name, default=default)
+    part.add_argument("--batches", type=int, nargs="*", default=[16, 32], help="other numbers of images a step")
+    part.add_argument("--frames", type=int, nargs="*", default=[], help="numbers of frames to train an epoch on")
+    part.add_argument("--steps", type=int, default=4, help="of a repetition")
+    part.add_argument("--repetitions", type=int, default=5)
+    part.add_argument("--workers", type=int, default=2, help="loader processes of the reference")
+    part.add_argument("--out", type=Path, help="a .json file for every figure")
+    part.set_defaults(call=_speed)
     part = parts.add_parser("scenes", help="what scenes cost to load whole: seconds, memory, disk")
     part.add_argument("root", type=Path, help="folder that holds them")
     part.add_argument("scenes", nargs="*", help="names; every official one that is there unless given")

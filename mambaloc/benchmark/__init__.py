@@ -6,14 +6,19 @@ from mambaloc.benchmark.loading import LoadingRates, measure_loading
 from mambaloc.benchmark.report import print_deployments, print_latencies, print_loading, print_scenes, print_sizes
 from mambaloc.benchmark.scenes import SceneCost, measure_scenes
 from mambaloc.benchmark.sizes import Size, size_of, size_table
+from mambaloc.benchmark.speed import Setting
+from mambaloc.benchmark.speed_report import SpeedReport, measure_all, print_report, write_report
 
 __all__ = [
     "Deployment",
     "Latency",
     "LoadingRates",
     "SceneCost",
+    "Setting",
     "Size",
+    "SpeedReport",
     "forward_flops",
+    "measure_all",
     "measure_deployment",
     "measure_latency",
     "measure_loading",
@@ -21,8 +26,10 @@ __all__ = [
     "print_deployments",
     "print_latencies",
     "print_loading",
+    "print_report",
     "print_scenes",
     "print_sizes",
     "size_of",
     "size_table",
+    "write_report",
 ]

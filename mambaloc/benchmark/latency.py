@@ -15,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, transform
 from mambaloc.models import LitPoseRegressor, create_model
-from mambaloc.types import Pose, PoseBatch
+from mambaloc.types import Pose, PoseBatch, height_and_width
 
 WARM_UP = 3
 
@@ -112,15 +112,16 @@ def training_step(system: LitPoseRegressor, frames: PoseBatch) -> Callable[[], o
     return call
 
 
-def random_frames(count: int, side: int, device: str = "cpu", seed: int = 0) -> PoseBatch:
+def random_frames(count: int, image_size: int | tuple[int, int], device: str = "cpu", seed: int = 0) -> PoseBatch:
     """A batch that every loss can read: one clip, each frame with scene points in view."""
     generator = torch.Generator().manual_seed(seed)
     position_m = torch.randn(count, 3, generator=generator)
     quaternion = canonical(torch.randn(count, 4, generator=generator))
     ahead_m = torch.randn(count, 64, 3, generator=generator) * 0.3 + torch.tensor([0.0, 0.0, 3.0])
-    intrinsics = torch.tensor([[side, 0.0, side / 2], [0.0, side, side / 2], [0.0, 0.0, 1.0]])
+    height, width = height_and_width(image_size)
+    intrinsics = torch.tensor([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
     return PoseBatch(
-        image=torch.rand(count, 3, side, side, generator=generator).to(device),
+        image=torch.rand(count, 3, height, width, generator=generator).to(device),
         position_m=position_m.to(device),
         quaternion=quaternion.to(device),
         index=torch.arange(count, device=device),
@@ -130,7 +131,7 @@ def random_frames(count: int, side: int, device: str = "cpu", seed: int = 0) -> 
     )
 
 
-def in_turns(calls: list[Callable[[], object]], repetitions: int, device: str = "cpu") -> list[list[float]]:
+def in_turns(calls: Sequence[Callable[[], object]], repetitions: int, device: str = "cpu") -> list[list[float]]:
     """Seconds of each call, one after the other so many times, after a warm-up: all meet the same machine."""
     for _ in range(WARM_UP):
         for call in calls:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchvision import transforms
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.augmentation import augment, draw_augmentations
+from mambaloc.data.augmentation import augment, augmentations, draw_uniforms
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -73,10 +73,11 @@ def _images_per_second(load: Callable[[list[int]], Tensor], batch_size: int, bat
 def _cached(data: PoseDataModule) -> Callable[[list[int]], Tensor]:
     frames = data.train_dataloader().dataset
     mean, std = (torch.tensor(values).view(3, 1, 1) for values in (_MEAN, _STD))
+    uniforms = draw_uniforms(0, 0, len(data.frames("train")))
 
     def load(indices: list[int]) -> Tensor:
         batch = frames.__getitems__(indices)  # type: ignore[attr-defined]
-        how = draw_augmentations(batch.image, data.crop, data.jitter, 0, 0, batch.index)
+        how = augmentations(batch.image, data.crop, data.jitter, uniforms[batch.index])
         return augment(batch.image, how, data.crop).sub_(mean).div_(std)
 
     return load

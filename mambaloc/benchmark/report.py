@@ -24,7 +24,7 @@ NOT_SHIPPED = f"\n* loses more than {LARGEST_LOSS:.0%} of its median error, so n
 
 def print_sizes(sizes: Sequence[Size]) -> None:
     """Print a row a system and GIS: shipped, published accounting, and the paper's figure."""
-    table = _table("Parameters", "system", "gis", "shipped", "MiB", "published", "MiB", "paper MiB")
+    table = new_table("Parameters", "system", "gis", "shipped", "MiB", "published", "MiB", "paper MiB")
     notes = []
     for size in sizes:
         paper = "" if size.paper_mib is None else f"{size.paper_mib:.2f}"
@@ -54,11 +54,11 @@ def _replaced(sizes: Sequence[Size]) -> list[str]:
 def print_latencies(latencies: Sequence[Latency], image_size: int, machine: str) -> None:
     """Print a row a system, measure and batch: medians, the ratio, its spread; then operations."""
     title = f"Milliseconds without and with GIS, {image_size} px, {machine}"
-    table = _table(title, "system", "what", "batch", "without ms", "with ms", "ratio", "± IQR")
+    table = new_table(title, "system", "what", "batch", "without ms", "with ms", "ratio", "± IQR")
     for each in latencies:
         times = (f"{median(s) * 1000:.1f}" for s in (each.without_s, each.with_s))
         table.add_row(each.system, each.what, str(each.batch), *times, f"{each.ratio:.3f}", f"{each.spread:.3f}")
-    flops = _table("Forward pass of one image", "system", "GFLOP without", "GFLOP with", "ratio")
+    flops = new_table("Forward pass of one image", "system", "GFLOP without", "GFLOP with", "ratio")
     for name in dict.fromkeys(each.system for each in latencies):
         without, with_gis = (forward_flops(name, gis, image_size) for gis in ("none", "gis"))
         flops.add_row(name, f"{without / 1e9:.3f}", f"{with_gis / 1e9:.3f}", f"{with_gis / without:.3f}")
@@ -70,7 +70,7 @@ def print_latencies(latencies: Sequence[Latency], image_size: int, machine: str)
 
 def print_deployments(deployments: Sequence[Deployment], threads: int, machine: str) -> None:
     """Print a row a system and form: size, latency with its spread, how much faster than the first row, errors."""
-    table = _table("Trained systems on a device", "system", "form", "MiB", "ms", "± IQR", "times faster", "m", "°")
+    table = new_table("Trained systems on a device", "system", "form", "MiB", "ms", "± IQR", "times faster", "m", "°")
     for each in deployments:
         times = (f"{1000 * s:.2f}" for s in (median(each.latency_s), each.spread_s))
         errors = (f"{each.position_error_m:.3f}", f"{each.rotation_error_deg:.2f}")
@@ -104,7 +104,7 @@ def print_loading(rates: LoadingRates, machine: str) -> None:
 def print_scenes(scenes: Sequence[SceneCost], machine: str) -> None:
     """Print a row a scene: frames, seconds, memory, disk; then which are the benchmark's, and which are rendered."""
     names = ("scene", "frames", "read s", "decode s", "open s", "memory MiB", "disk MiB")
-    table = _table("Scenes loaded whole: train + test frames, images + cache on disk", *names)
+    table = new_table("Scenes loaded whole: train + test frames, images + cache on disk", *names)
     for each in scenes:
         train, test = each.counts
         seconds = (f"{s:.1f}" for s in (each.read_s, each.build_s, each.open_s))
@@ -126,9 +126,10 @@ def print_scenes(scenes: Sequence[SceneCost], machine: str) -> None:
     console.print(machine, soft_wrap=True)
 
 
-def _table(title: str, *columns: str) -> Table:
+def new_table(title: str, *columns: str) -> Table:
+    """Begin a table; columns of words to the left, of numbers to the right."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for column in columns:
-        text = column in ("system", "gis", "what", "form", "scene")
+        text = column in ("system", "gis", "what", "form", "scene", "part", "left out", "kernel", "way")
         table.add_column(column, justify="left" if text else "right", no_wrap=True)
     return table

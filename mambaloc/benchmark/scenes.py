@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import resource
-import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -15,6 +13,7 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 from rich.progress import track
 
+from mambaloc.benchmark.footprint import peak_bytes
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets import DATASETS, scene_folder
 from mambaloc.data.frames import BadFrames, Split
@@ -98,7 +97,7 @@ def _measure(dataset: str, root: Path, scene: str, short_side: int, cache: str) 
         data.setup("test")
         return data, time.perf_counter() - start
 
-    start_bytes = _peak_bytes()
+    start_bytes = peak_bytes()
     start = time.perf_counter()
     folder = scene_folder(dataset, root, scene)
     splits: tuple[Split, ...] = ("train", "test")
@@ -117,13 +116,8 @@ def _measure(dataset: str, root: Path, scene: str, short_side: int, cache: str) 
         read_s,
         build_s - read_s,
         open_s,
-        _peak_bytes(),
+        peak_bytes(),
         start_bytes,
         sum(path.stat().st_size for part in ("train", "test") for path in data.frames(part).image_paths),
         sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file()),
     )
-
-
-def _peak_bytes() -> int:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak  # kilobytes elsewhere

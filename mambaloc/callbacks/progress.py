@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+import time
+from typing import Any
+
 import lightning as L
 from lightning.pytorch.callbacks import RichProgressBar
 
+_DRAWN_EVERY_S = 0.1
+
 
 class PoseProgressBar(RichProgressBar):
-    """Rich progress bar that shows the latest validation medians in metres and degrees."""
+    """Rich progress bar that shows the latest validation medians in metres and degrees, drawn ten times a second."""
+
+    _drawn_s = 0.0
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Draw, unless that was done just now: it takes longer than a fast step, and reading a loss waits for a GPU."""
+        now = time.monotonic()
+        if now - self._drawn_s >= _DRAWN_EVERY_S or batch_idx + 1 == trainer.num_training_batches:
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+            self._drawn_s = now
 
     def get_metrics(
         self, trainer: L.Trainer, pl_module: L.LightningModule

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -32,6 +34,7 @@ class CachedFrames(Dataset[PoseBatch]):
         clips: NDArray[np.int64] | None = None,
     ) -> None:
         self.frames, self.images, self.points = frames, images, points
+        self.resident: Tensor | None = None
         self.clips = np.arange(len(frames))[:, None] if clips is None else clips
         self.position_m = torch.from_numpy(frames.position_m).float()
         self.quaternion = torch.from_numpy(frames.quaternion).float()
@@ -45,11 +48,23 @@ class CachedFrames(Dataset[PoseBatch]):
     def __len__(self) -> int:
         return len(self.clips)
 
+    def to(self, device: torch.device) -> CachedFrames:
+        """Return the same frames, whole in a device's memory: batches are made there, and nothing is copied to it."""
+        there = copy(self)
+        there.resident = torch.from_numpy(np.array(self.images)).to(device)
+        for name in ("position_m", "quaternion", "points_m", "intrinsics"):
+            if (values := getattr(self, name)) is not None:
+                setattr(there, name, values.to(device))
+        return there
+
     def __getitems__(self, items: list[int]) -> PoseBatch:
         """Fetch items, clip after clip: ``image`` (B, 3, H, W) uint8 as cached, uncropped, with its ``intrinsics``."""
-        index = torch.from_numpy(self.clips[items].ravel())
+        rows = self.clips[items].ravel()
+        index = torch.from_numpy(rows).to(self.position_m.device, non_blocking=True)
         return PoseBatch(
-            torch.from_numpy(np.stack([self.images[row] for row in index.tolist()])),
+            torch.from_numpy(np.stack([self.images[row] for row in rows]))
+            if self.resident is None
+            else self.resident[index],
             self.position_m[index],
             self.quaternion[index],
             index,

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import inspect
+import math
 import pickle
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import lightning as L
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
+from torch.optim import lr_scheduler
 
 from mambaloc import provenance
 from mambaloc.data import PoseDataModule
@@ -19,6 +22,9 @@ from mambaloc.losses import build_loss
 from mambaloc.metrics import PoseErrors
 from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale
 from mambaloc.types import PoseBatch, PosePrediction, height_and_width
+
+Schedule = Literal["step", "cosine", "one_cycle"]
+CompileMode = Literal["default", "reduce-overhead"]
 
 
 class LitPoseRegressor(L.LightningModule):
@@ -40,9 +46,14 @@ class LitPoseRegressor(L.LightningModule):
         warm_start: checkpoint of a like network, whose weights the training starts from.
         loss: name in ``mambaloc.losses.LOSSES``.
         loss_args: that loss's arguments.
-        lr: learning rate of Adam.
+        compile_mode: run training steps through ``torch.compile`` in this mode: ``default``, or ``reduce-overhead``,
+            which replays CUDA graphs. It takes a minute or so before the first step, less where it was done before.
+        frozen_groups: layer groups of the backbone, from the image on, that stay as they start, statistics included.
+        lr: learning rate of Adam, or its highest value.
         weight_decay: L2 penalty, never on loss weights nor on a state-space mixer's A and D.
-        lr_step_epochs: epochs between cuts of the learning rate: 100 indoors, 200 outdoors in the paper.
+        schedule: ``step`` cuts the learning rate; ``cosine`` lets it fall to nothing over the whole training;
+            ``one_cycle`` first lets it rise (Smith and Topin 2018). The last two need a given number of epochs.
+        lr_step_epochs: under ``step``, epochs between cuts: 100 indoors, 200 outdoors in the paper.
         lr_gamma: what a cut multiplies the learning rate by.
         normalise_position: regress positions relative to the training positions' mean and spread.
     """
@@ -63,8 +74,11 @@ class LitPoseRegressor(L.LightningModule):
         warm_start: str | None = None,
         loss: str = "learned_weights",
         loss_args: dict[str, Any] | None = None,
+        compile_mode: CompileMode | None = None,
+        frozen_groups: int = 0,
         lr: float = 1e-4,
         weight_decay: float = 1e-4,
+        schedule: Schedule = "step",
         lr_step_epochs: int = 100,
         lr_gamma: float = 0.1,
         normalise_position: bool = False,
@@ -73,13 +87,18 @@ class LitPoseRegressor(L.LightningModule):
         self.image_size = height_and_width(image_size)
         self.loss = build_loss(loss, loss_args)
         self.lr, self.weight_decay, self.lr_step_epochs, self.lr_gamma = lr, weight_decay, lr_step_epochs, lr_gamma
-        self.normalise_position = normalise_position
+        if schedule not in get_args(Schedule):
+            raise InputError(f"model.schedule {schedule!r}: choose one of {', '.join(get_args(Schedule))}")
+        self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode
+        self._compiled: Callable[[Tensor], PosePrediction] | None = None
         self.val_errors, self.test_errors = PoseErrors(), PoseErrors()
         self.provenance: dict[str, Any] = {}
         self.save_hyperparameters()
         self.network = self.configure_network()
         if warm_start is not None:
             start_from(self.network, warm_start)
+        if frozen_groups:
+            self.network.backbone.freeze(frozen_groups)
 
     def configure_network(self) -> PoseNetwork:
         """Build the network from the hyperparameters: images in, :class:`~mambaloc.types.PosePrediction` out."""
@@ -102,11 +121,19 @@ class LitPoseRegressor(L.LightningModule):
         return self.network(image)
 
     def setup(self, stage: str) -> None:
-        """Take the scene's position statistics before the first epoch."""
+        """Take the scene's position statistics before the first epoch, and compile what the epochs run."""
         if stage == "fit" and self.normalise_position:
             for module in self.network.modules():
                 if isinstance(module, PositionScale):
                     module.fit(self.scene_for("normalise_position").train_position_m)
+        if stage == "fit" and self.compile_mode is not None:
+            # The function, not the module: the state dict keeps its names, and validation, whose predictions outlive
+            # the step that a CUDA graph overwrites, runs without.
+            self._compiled = torch.compile(self.network.forward, mode=self.compile_mode)
+
+    def teardown(self, stage: str) -> None:
+        """Let go of what was compiled: checkpoints and copies know nothing of it."""
+        self._compiled = None
 
     def scene_for(self, argument: str) -> Any:
         """Return the trainer's data module, of which an argument asks more than batches.
@@ -129,7 +156,7 @@ class LitPoseRegressor(L.LightningModule):
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
         """Return the loss of a batch; auxiliary heads weigh 0.3 each (Szegedy et al. 2015)."""
-        prediction = self(batch.image)
+        prediction = (self._compiled or self)(batch.image)
         loss = self.loss(prediction, batch)
         for auxiliary in prediction.auxiliary:
             loss = loss + 0.3 * self.loss(auxiliary, batch)
@@ -176,7 +203,11 @@ class LitPoseRegressor(L.LightningModule):
         self.test_errors.reset()
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """Adam and a stepwise learning rate, as the paper prints them."""
+        """Adam and a stepwise learning rate, as the paper prints them, or another schedule.
+
+        Raises:
+            InputError: where a schedule over the whole training does not know its length.
+        """
         undecayed = {
             id(parameter)
             for module in self.modules()
@@ -194,8 +225,18 @@ class LitPoseRegressor(L.LightningModule):
         # refuses to clip a fused optimiser's gradients under mixed precision.
         clips = self._trainer is not None and bool(self.trainer.gradient_clip_val)
         optimizer = torch.optim.Adam(groups, lr=self.lr, betas=(0.9, 0.999), eps=1e-10, fused=not clips)
-        scheduler = torch.optim.lr_scheduler.StepLR(optimizer, self.lr_step_epochs, self.lr_gamma)
-        return {"optimizer": optimizer, "lr_scheduler": scheduler}
+        if self.schedule == "step":
+            by_epoch = lr_scheduler.StepLR(optimizer, self.lr_step_epochs, self.lr_gamma)
+            return {"optimizer": optimizer, "lr_scheduler": by_epoch}
+        steps = self.trainer.estimated_stepping_batches
+        if math.isinf(steps):
+            raise InputError(f"model.schedule {self.schedule}: needs the training's length; set trainer.max_epochs")
+        by_step: lr_scheduler.LRScheduler
+        if self.schedule == "cosine":
+            by_step = lr_scheduler.CosineAnnealingLR(optimizer, int(steps))
+        else:
+            by_step = lr_scheduler.OneCycleLR(optimizer, self.lr, int(steps), cycle_momentum=False)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": by_step, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Write which system this is and where it was trained."""

@@ -10,6 +10,7 @@ import timm
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
+from timm.models import group_parameters
 from torch import Tensor, nn
 
 from mambaloc.errors import InputError
@@ -57,6 +58,22 @@ class ImageBackbone(nn.Module):
     def normalised(self, image: Tensor) -> Tensor:
         """What the body sees of an image in 0..1."""
         return ((image - self.pixel_mean) / self.pixel_std).contiguous(memory_format=torch.channels_last)
+
+    def freeze(self, groups: int) -> None:
+        """Keep the first layer groups, from the image on, as they are: weights, and batch-norm statistics.
+
+        Raises:
+            InputError: where the backbone has fewer groups.
+        """
+        if not hasattr(self.model, "group_matcher"):
+            raise InputError(f"frozen_groups {groups}: {self.name} has no layer groups; set it to 0")
+        names = group_parameters(self.model, self.model.group_matcher(coarse=True))
+        if not 0 <= groups <= len(names):
+            raise InputError(f"frozen_groups {groups}: {self.name} has {len(names)}; choose one of 0 to {len(names)}")
+        for group in sorted(names)[:groups]:
+            for name in names[group]:
+                self.model.get_parameter(name).requires_grad_(False)
+                self.model.get_submodule(name.rpartition(".")[0]).eval()
 
     def _load(self, path: Path) -> None:
         if path.suffix != ".safetensors":

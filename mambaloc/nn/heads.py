@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mambaloc.geometry import quaternion_from_log
+from mambaloc.nn.backbone import ImageBackbone
 from mambaloc.types import PosePrediction
 
 Rotation = Literal["quaternion", "log_quaternion"]
@@ -102,6 +103,7 @@ class PoseNetwork(nn.Module):
         (B, 3, H, W) in 0..1 -> :class:`~mambaloc.types.PosePrediction`.
     """
 
+    backbone: ImageBackbone
     head: PoseHead
     image_size: tuple[int, int] | None = None
     """(height, width) that the network was built for; None takes any."""

@@ -57,7 +57,7 @@ def readings(network: PoseNetwork, image: Tensor) -> tuple[Reading, Reading]:
     Raises:
         InputError: for a backbone without a map, such as a vision transformer.
     """
-    with torch.enable_grad(), _listening(network.backbone) as maps:  # type: ignore[arg-type]
+    with torch.enable_grad(), _listening(network.backbone) as maps:
         prediction = network(image.detach().requires_grad_())
         answers = (
             network.head.position_scale.normalise(prediction.position_m),

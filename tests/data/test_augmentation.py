@@ -7,7 +7,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from mambaloc.data.augmentation import Augmentations, Jitter, augment, center_crop, color_matrix, draw_augmentations
+from mambaloc.data.augmentation import (
+    Augmentations,
+    Jitter,
+    augment,
+    augmentations,
+    center_crop,
+    color_matrices,
+    draw_uniforms,
+)
 
 SIZE, CROP = (24, 32), (16, 20)
 
@@ -25,6 +33,11 @@ def smooth_images(count: int) -> Tensor:
 
 def indices(*rows: int) -> Tensor:
     return torch.tensor(rows)
+
+
+def drawn(image: Tensor, crop: tuple[int, int], jitter: Jitter, seed: int, epoch: int, rows: Tensor) -> Augmentations:
+    """What an epoch does to some of its frames."""
+    return augmentations(image, crop, jitter, draw_uniforms(seed, epoch, int(rows.max()) + 1)[rows])
 
 
 def factors_of(how: Augmentations, gray: float) -> np.ndarray:
@@ -46,7 +59,7 @@ def test_color_matrix_is_torchvisions_three_adjustments(factors):
     assert expected.min() > 0
     assert expected.max() < 1
     luma_mean = F.rgb_to_grayscale(image.double() / 255).mean().item()
-    matrix = torch.from_numpy(color_matrix(*factors, luma_mean))
+    matrix = color_matrices(*(torch.tensor([value]).double() for value in (*factors, luma_mean)))[0]
     actual = torch.einsum("rc,chw->rhw", matrix[:, :3], image.double() / 255) + matrix[:, 3, None, None]
     assert (actual - expected).abs().max() < 1e-3  # torchvision's red weighs 0.2989, ours 0.299
 
@@ -56,8 +69,8 @@ def test_drawn_colors_are_torchvisions_on_the_whole_image():
     F = pytest.importorskip("torchvision.transforms.v2.functional")
     batch, rows = smooth_images(16), torch.arange(16)
     gray = torch.full_like(batch, 128)
-    factors = factors_of(draw_augmentations(gray, CROP, Jitter(), 3, 4, rows), 128 / 255)
-    how = draw_augmentations(batch, CROP, Jitter(), 3, 4, rows)
+    factors = factors_of(drawn(gray, CROP, Jitter(), 3, 4, rows), 128 / 255)
+    how = drawn(batch, CROP, Jitter(), 3, 4, rows)
     out = augment(batch, how, CROP)
     for row, (brightness, contrast, saturation) in enumerate(factors.tolist()):
         expected = F.adjust_brightness(batch[row].float() / 255, brightness)
@@ -71,7 +84,7 @@ def test_drawn_colors_are_torchvisions_on_the_whole_image():
 
 def test_crop_is_a_slice():
     batch, rows = images(12), torch.arange(12)
-    how = draw_augmentations(batch, CROP, Jitter(0, 0, 0), 0, 0, rows)
+    how = drawn(batch, CROP, Jitter(0, 0, 0), 0, 0, rows)
     out = augment(batch, how, CROP)
     assert out.shape == (12, 3, *CROP)
     assert out.dtype == torch.float32
@@ -84,24 +97,24 @@ def test_crop_is_a_slice():
 
 def test_every_place_of_the_crop_is_drawn_and_none_beyond():
     batch = images(1).expand(600, -1, -1, -1)
-    how = draw_augmentations(batch, (22, 29), Jitter(), 0, 0, torch.arange(600))
+    how = drawn(batch, (22, 29), Jitter(), 0, 0, torch.arange(600))
     corners = set(zip(how.top.tolist(), how.left.tolist(), strict=True))
     assert corners == {(top, left) for top in range(3) for left in range(4)}
 
 
 def test_a_crop_of_the_whole_image_stays_where_it_is():
     batch = images(3)
-    how = draw_augmentations(batch, SIZE, Jitter(0, 0, 0), 0, 0, torch.arange(3))
+    how = drawn(batch, SIZE, Jitter(0, 0, 0), 0, 0, torch.arange(3))
     np.testing.assert_allclose(augment(batch, how, SIZE).numpy(), batch.numpy() / 255, atol=1e-6)
 
 
 def test_drawing_depends_on_seed_epoch_and_index_alone():
     batch = images(4)
-    whole = draw_augmentations(batch, CROP, Jitter(), 1, 2, indices(7, 3, 100, 8))
+    whole = drawn(batch, CROP, Jitter(), 1, 2, indices(7, 3, 100, 8))
     torch.manual_seed(99)
     np.random.seed(99)  # noqa: NPY002 -- the global state is what must not matter
     for order in ([0, 1, 2, 3], [2], [3, 1], [1, 0, 3, 2]):
-        part = draw_augmentations(batch[order], CROP, Jitter(), 1, 2, indices(7, 3, 100, 8)[order])
+        part = drawn(batch[order], CROP, Jitter(), 1, 2, indices(7, 3, 100, 8)[order])
         assert torch.equal(part.top, whole.top[order])
         assert torch.equal(part.left, whole.left[order])
         assert torch.equal(part.color, whole.color[order])
@@ -110,15 +123,26 @@ def test_drawing_depends_on_seed_epoch_and_index_alone():
 @pytest.mark.parametrize("other", [(2, 2, 7), (1, 3, 7), (1, 2, 8), (2, 1, 7)])
 def test_another_seed_epoch_or_index_draws_otherwise(other):
     batch = images(1)
-    first = draw_augmentations(batch, CROP, Jitter(), 1, 2, indices(7))
-    second = draw_augmentations(batch, CROP, Jitter(), other[0], other[1], indices(other[2]))
+    first = drawn(batch, CROP, Jitter(), 1, 2, indices(7))
+    second = drawn(batch, CROP, Jitter(), other[0], other[1], indices(other[2]))
     assert not torch.allclose(first.color, second.color)
+
+
+def test_an_epochs_chances_do_not_depend_on_how_many_frames_there_are():
+    assert torch.equal(draw_uniforms(1, 2, 100)[:7], draw_uniforms(1, 2, 7))
+
+
+def test_the_largest_chance_still_crops_inside():
+    batch, uniform = images(1), torch.full((1, 5), 1 - 2**-24)
+    for crop in ((1, 1), (16, 20), (23, 31), SIZE):
+        how = augmentations(batch, crop, Jitter(), uniform)
+        assert (how.top.item(), how.left.item()) == (SIZE[0] - crop[0], SIZE[1] - crop[1])
 
 
 @pytest.mark.parametrize("jitter", [Jitter(), Jitter(0.1, 0.4, 0.0), Jitter(0.0, 0.2, 0.5)])
 def test_factors_fill_their_ranges(jitter):
     gray = torch.full((500, 3, 8, 8), 100, dtype=torch.uint8)
-    how = draw_augmentations(gray, (8, 8), jitter, 0, 0, torch.arange(500))
+    how = drawn(gray, (8, 8), jitter, 0, 0, torch.arange(500))
     spread = np.array([jitter.brightness, jitter.contrast, jitter.saturation])
     factors = factors_of(how, 100 / 255)
     assert (np.abs(factors - 1) <= spread + 1e-5).all()
@@ -134,7 +158,7 @@ def test_an_image_is_never_mirrored():
     batch = torch.zeros(300, 3, *SIZE, dtype=torch.uint8)
     batch[..., 12:, :] += 60  # lower half
     batch[..., 16:] += 120  # right half
-    out = augment(batch, draw_augmentations(batch, CROP, Jitter(), 0, 0, torch.arange(300)), CROP).mean(1)
+    out = augment(batch, drawn(batch, CROP, Jitter(), 0, 0, torch.arange(300)), CROP).mean(1)
     assert (out[:, 0, -1] > out[:, 0, 0]).all()
     assert (out[:, -1, 0] > out[:, 0, 0]).all()
 
@@ -142,7 +166,7 @@ def test_an_image_is_never_mirrored():
 @pytest.mark.parametrize(("low", "high"), [(0, 1), (255, 256), (0, 256)])
 def test_values_stay_in_0_to_1(low, high):
     batch = images(32, low, high)
-    out = augment(batch, draw_augmentations(batch, CROP, Jitter(1.0, 1.0, 1.0), 0, 0, torch.arange(32)), CROP)
+    out = augment(batch, drawn(batch, CROP, Jitter(1.0, 1.0, 1.0), 0, 0, torch.arange(32)), CROP)
     assert out.min() >= 0
     assert out.max() <= 1
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mambaloc.data import datasets
-from mambaloc.data.augmentation import Jitter, augment, draw_augmentations
+from mambaloc.data.augmentation import Jitter, augment, augmentations, draw_uniforms
 from mambaloc.data.datamodule import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.types import PoseBatch
@@ -227,6 +227,21 @@ def test_workers_give_the_same_batches(make):
             assert torch.equal(getattr(alone, name), getattr(by_worker, name))
 
 
+@pytest.mark.parametrize("clips", [{}, {"clip_length": 3, "clip_skip": 2}])
+def test_resident_frames_give_the_same_batches_as_the_memory_map(make, clips):
+    batches = []
+    for resident in (None, True):
+        module = make(resident=resident, num_workers=2, batch_size=6, **clips)
+        module.setup("fit")
+        loader = module.train_dataloader()
+        assert loader.num_workers == (0 if resident else 2)
+        batches.append([*loader, *module.val_dataloader()])
+    for mapped, in_memory in zip(*batches, strict=True):
+        assert mapped.clip_length == in_memory.clip_length
+        for name in ("image", "position_m", "quaternion", "index"):
+            assert torch.equal(getattr(mapped, name), getattr(in_memory, name))
+
+
 def gradient_batch() -> PoseBatch:
     image = torch.arange(16 * 21, dtype=torch.uint8).reshape(1, 1, 16, 21).repeat(4, 3, 1, 1)
     return PoseBatch(image, torch.zeros(4, 3), torch.zeros(4, 4), torch.arange(4))
@@ -249,9 +264,10 @@ def test_outside_training_a_batch_is_cropped_in_the_centre(make, trainer, image_
 def test_training_batches_are_augmented_by_seed_epoch_and_index(make, monkeypatch):
     monkeypatch.setenv("PL_GLOBAL_SEED", "5")
     module, batch = make(image_size=(12, 14), brightness=0.1, contrast=0.2, saturation=0.4), gradient_batch()
+    module.setup("fit")
     module.trainer = SimpleNamespace(training=True, current_epoch=2)
     out = module.on_after_batch_transfer(batch, 0).image
-    how = draw_augmentations(batch.image, (12, 14), Jitter(0.1, 0.2, 0.4), 5, 2, batch.index)
+    how = augmentations(batch.image, (12, 14), Jitter(0.1, 0.2, 0.4), draw_uniforms(5, 2, 4))
     assert torch.equal(out, augment(batch.image, how, (12, 14)))
     assert not torch.equal(out[0], out[1])
     module.trainer.current_epoch = 3

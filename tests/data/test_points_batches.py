@@ -82,6 +82,7 @@ def test_points_project_onto_their_texture_in_every_crop(make, training):
         current_epoch=3,
         world_size=1,
         global_rank=0,
+        strategy=SimpleNamespace(root_device=torch.device("cpu")),
         fit_loop=SimpleNamespace(epoch_progress=SimpleNamespace(current=SimpleNamespace(processed=3))),
     )
     shifts = []
