@@ -144,7 +144,8 @@ class RecipeCLI(LightningCLI):
 def run_directory(config: Namespace) -> Path:
     """Name a run's folder: a resumed run's own, else ``trainer.default_root_dir``, else ``runs/RECIPE/TIME``.
 
-    The processes that Lightning starts for a distributed run are told by the first one.
+    The processes that Lightning starts for a distributed run are told by the first one; those that SLURM starts name it
+    after their job.
     """
     if os.environ.get("LOCAL_RANK", "0") != "0" and _RUN_DIR in os.environ:
         return Path(os.environ[_RUN_DIR])
@@ -155,7 +156,8 @@ def run_directory(config: Namespace) -> Path:
         run_dir = Path(config.trainer.default_root_dir)
     else:
         name = "+".join(Path(str(recipe)).stem for recipe in config.config or []) or "run"
-        run_dir = Path("runs", name, datetime.now().strftime("%Y%m%d-%H%M%S"))
+        job = os.environ.get("SLURM_JOB_ID")
+        run_dir = Path("runs", name, f"job-{job}" if job else datetime.now().strftime("%Y%m%d-%H%M%S"))
     os.environ[_RUN_DIR] = str(run_dir)
     return run_dir
 

@@ -55,5 +55,6 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", "LightningCLI's args parameter is intended")  # ours are made from sys.argv
     warnings.filterwarnings("ignore", ".*treespec, LeafSpec")
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")  # a resumed run's own
+    warnings.filterwarnings("ignore", "Found .* in eval mode at the start")  # a teacher, or frozen groups
     warnings.filterwarnings("ignore", ".*does not have many workers")  # decoded frames need none
     warnings.filterwarnings("ignore", "Total length of `list` across ranks is zero")  # no validation was asked for

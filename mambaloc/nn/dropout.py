@@ -27,4 +27,4 @@ class Dropout(nn.Dropout):
         draws = torch.empty(-(-input.numel() // _PER_DRAW), dtype=torch.int64).random_(-(2**63), None)
         chances = draws.view(torch.int16)[: input.numel()].view(input.shape)
         kept = chances >= dropped - _CHANCES // 2
-        return input * (kept * (_CHANCES / (_CHANCES - dropped)))
+        return input * kept.to(input.dtype).mul_(_CHANCES / (_CHANCES - dropped))

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 
 import mambaloc
 from mambaloc.cli import main, recipe_arguments
@@ -185,19 +184,3 @@ def test_selection_rule_is_written_into_the_result(validation, tiny_recipe, tmp_
         assert results == ["last"]
     else:
         assert "ON THE TEST SET" in results[0]
-
-
-@pytest.mark.slow
-def test_two_processes_give_the_errors_of_one(tiny_recipe, tmp_path):
-    """DDP over two CPU processes: the medians are those of the whole validation set."""
-    recipe = yaml.safe_load(tiny_recipe.read_text())
-    recipe["trainer"] |= {"devices": 2, "strategy": "ddp", "max_epochs": 1}
-    (tmp_path / "ddp.yaml").write_text(yaml.safe_dump(recipe))
-    run = tmp_path / "run"
-    done = tool("train", tmp_path / "ddp.yaml", "--trainer.default_root_dir", run)
-    assert done.returncode == 0, done.stderr
-    with (run / "metrics/version_0/metrics.csv").open() as file:
-        logged = next(float(r["val/position_error_m"]) for r in csv.DictReader(file) if r["val/position_error_m"])
-    words = ["validate", str(tiny_recipe), "--ckpt_path", str(run / "checkpoints/last.ckpt")]
-    alone = main([*words, "--trainer.logger", "false"]).trainer.callback_metrics["val/position_error_m"].item()
-    assert logged == pytest.approx(alone, rel=1e-5)
