@@ -127,6 +127,8 @@ class LitDistillation(LitStudent):
             )
         if teacher is None:
             raise InputError("model.teacher: distillation needs one; train any system, and name its checkpoint")
+        if student.get("compile_mode"):
+            raise InputError("model.compile_mode: steps with a teacher do not run compiled; set it to null")
         super().__init__(**student)
         self.answers: Answers | None = None
 

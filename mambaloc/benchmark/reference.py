@@ -1,7 +1,7 @@
 """What speed is compared with: the training loop and the network of published research code.
 
-The loop decodes every frame every epoch (PIL, torchvision transforms, loader workers), computes in float32, eagerly, and
-reads each loss with ``.item()``. The network does what ours does, in the form it was published: see :class:`Published`.
+The loop decodes every frame every epoch (PIL, torchvision transforms, loader workers), computes in float32, eagerly,
+and reads each loss with ``.item()``. The network does what ours does, in its published form: see :class:`Published`.
 """
 
 from __future__ import annotations

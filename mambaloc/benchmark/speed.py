@@ -1,7 +1,7 @@
 """Training and evaluation speed in one run, beside the loop and the network of published research code.
 
 Ours is measured as it is used: ``Trainer.fit`` on a :class:`~mambaloc.data.PoseDataModule`, timed by a callback. After
-each of its epochs the reference (:mod:`mambaloc.benchmark.reference`) takes its turn, so that both meet the same machine.
+each of its epochs the reference (:mod:`mambaloc.benchmark.reference`) takes its turn: both meet the same machine.
 """
 
 from __future__ import annotations

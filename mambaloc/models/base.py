@@ -49,6 +49,8 @@ class LitPoseRegressor(L.LightningModule):
         compile_mode: run training steps through ``torch.compile`` in this mode: ``default``, or ``reduce-overhead``,
             which replays CUDA graphs. It takes a minute or so before the first step, less where it was done before.
         frozen_groups: layer groups of the backbone, from the image on, that stay as they start, statistics included.
+        frozen_statistics: normalise by the statistics that the backbone starts with, in all of it: for one trained on
+            many more images than the scene has.
         lr: learning rate of Adam, or its highest value.
         weight_decay: L2 penalty, never on loss weights nor on a state-space mixer's A and D.
         schedule: ``step`` cuts the learning rate; ``cosine`` lets it fall to nothing over the whole training;
@@ -76,6 +78,7 @@ class LitPoseRegressor(L.LightningModule):
         loss_args: dict[str, Any] | None = None,
         compile_mode: CompileMode | None = None,
         frozen_groups: int = 0,
+        frozen_statistics: bool = False,
         lr: float = 1e-4,
         weight_decay: float = 1e-4,
         schedule: Schedule = "step",
@@ -99,6 +102,8 @@ class LitPoseRegressor(L.LightningModule):
             start_from(self.network, warm_start)
         if frozen_groups:
             self.network.backbone.freeze(frozen_groups)
+        if frozen_statistics:
+            self.network.backbone.freeze_statistics()
 
     def configure_network(self) -> PoseNetwork:
         """Build the network from the hyperparameters: images in, :class:`~mambaloc.types.PosePrediction` out."""

@@ -12,6 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from timm.models import group_parameters
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from mambaloc.errors import InputError
 
@@ -74,6 +75,12 @@ class ImageBackbone(nn.Module):
             for name in names[group]:
                 self.model.get_parameter(name).requires_grad_(False)
                 self.model.get_submodule(name.rpartition(".")[0]).eval()
+
+    def freeze_statistics(self) -> None:
+        """Let every batch norm use, and keep, the statistics that it has."""
+        for module in self.modules():
+            if isinstance(module, _BatchNorm):
+                module.eval()
 
     def _load(self, path: Path) -> None:
         if path.suffix != ".safetensors":

@@ -7,7 +7,7 @@ import cv2
 import pytest
 import torch
 
-from mambaloc.callbacks import PoseProgressBar, WallClock, wall_clock
+from mambaloc.callbacks import PoseProgressBar, WallClock, progress, wall_clock
 from mambaloc.cli import main
 from mambaloc.errors import InputError
 
@@ -69,6 +69,18 @@ def test_progress_bar_shows_metres_and_degrees():
     names = {"train/loss": -1.25, "val/position_error_m": 0.1234, "val/rotation_error_deg": 5.678}
     trainer = SimpleNamespace(callback_metrics={name: torch.tensor(value) for name, value in names.items()})
     assert PoseProgressBar().get_metrics(trainer, CPU) == {"loss": "-1.250", "val": "0.123 m 5.68 deg"}
+
+
+def test_progress_bar_draws_at_intervals_not_at_steps(monkeypatch):
+    """Of a hundred steps a hundredth of a second apart: the first, one every tenth of a second, and the last."""
+    drawn, now = [], SimpleNamespace(s=50.0)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now.s)
+    monkeypatch.setattr(progress.RichProgressBar, "on_train_batch_end", lambda *args: drawn.append(args[-1]))
+    bar, trainer = PoseProgressBar(), SimpleNamespace(num_training_batches=98)
+    for batch_idx in range(98):
+        bar.on_train_batch_end(trainer, CPU, None, None, batch_idx)
+        now.s += 0.0100001
+    assert drawn == [*range(0, 98, 10), 97]
 
 
 @pytest.mark.slow

@@ -203,6 +203,7 @@ def test_a_plain_students_checkpoint_resumes_no_distillation(teacher, scenes, tm
         ({"image_size": 48}, "32x32 and 48x48 pixels; set data.image_size"),
         ({"hard_weight": 0, "soft_weight": 0}, "give one of them"),
         ({"feature_weight": -1}, "none is negative"),
+        ({"compile_mode": "default"}, r"model\.compile_mode: steps with a teacher"),
         ({"soft_args": {"temprature": 3}}, "soft_args"),
         ({"soft": "mse"}, "'kl' or 'l2'"),
     ],

@@ -132,6 +132,15 @@ def test_frozen_groups_stay_as_they_start(scenes):
     assert changed == {"layer2", "layer3"}  # groups 0 and 1 are the stem and layer1; their statistics, too, stayed
 
 
+def test_frozen_statistics_stay_while_weights_change(scenes):
+    L.seed_everything(3, verbose=False)
+    start = create_model("mambaloc", image_size=32, **SMALL).network.backbone.model.state_dict()
+    system, _ = fit(scenes, {"frozen_statistics": True}, max_epochs=2)
+    trained = system.network.backbone.model.state_dict()
+    kept = {name for name in start if torch.equal(start[name], trained[name])}
+    assert kept == {name for name in start if "running_" in name or "num_batches" in name}
+
+
 @pytest.mark.parametrize(("model", "groups"), [("mambaloc", 9), ("student", -1)])
 def test_groups_that_a_backbone_lacks(model, groups):
     with pytest.raises(InputError, match=rf"frozen_groups {groups}: resnet10t has \d; choose one of 0 to \d"):
