@@ -15,7 +15,15 @@ from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler
 
 from mambaloc import provenance
-from mambaloc.data.augmentation import Jitter, augment, augmentations, center_corner, center_crop, draw_uniforms
+from mambaloc.data.augmentation import (
+    Augmentations,
+    Jitter,
+    augment,
+    augmentations,
+    center_corner,
+    center_crop,
+    draw_uniforms,
+)
 from mambaloc.data.cache import cached_frames
 from mambaloc.data.cached_dataset import CachedFrames
 from mambaloc.data.datasets import DATASETS, is_official, is_rendered, scene_folder
@@ -23,7 +31,7 @@ from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
 from mambaloc.data.points import read_points
 from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
 from mambaloc.errors import InputError
-from mambaloc.geometry import cropped_intrinsics
+from mambaloc.geometry import canonical, cropped_intrinsics, multiply, turn_towards
 from mambaloc.types import PoseBatch, height_and_width
 
 Part = Literal["train", "val", "test"]
@@ -56,6 +64,9 @@ class PoseDataModule(L.LightningDataModule):
         brightness: range of that jitter factor, ``[1 - x, 1 + x]``.
         contrast: likewise.
         saturation: likewise.
+        focal_ratio: focal length of the scene's cameras over their images' width, 0.914 for 7-Scenes. If given, the
+            true rotation turns with each random crop, as a camera that looks at the crop's middle would; otherwise, as
+            the paper has it, the same pose is asked of every crop, which are degrees apart.
         validation: how the best epoch is chosen; ``test_set`` selects on the test set and is reported as such.
         val_fraction: share of the training frames that is held out.
         val_gap: frames dropped between a held-out block and training frames.
@@ -84,6 +95,7 @@ class PoseDataModule(L.LightningDataModule):
         brightness: float = 0.3,
         contrast: float = 0.3,
         saturation: float = 0.3,
+        focal_ratio: float | None = None,
         validation: Validation = "auto",
         val_fraction: float = 0.1,
         val_gap: int = 20,
@@ -103,6 +115,11 @@ class PoseDataModule(L.LightningDataModule):
             raise InputError(f"data.image_size {image_size}: larger than data.short_side {short_side}; enlarge that")
         if points_per_frame < 0:
             raise InputError(f"data.points_per_frame {points_per_frame}: must be 0 or more; 0 reads none")
+        if focal_ratio is not None and (focal_ratio <= 0 or points_per_frame > 0):
+            raise InputError(
+                f"data.focal_ratio {focal_ratio}: must be more than 0, and is not for scene points, whose intrinsics "
+                "follow the crop; leave it out"
+            )
         self.jitter = Jitter(brightness, contrast, saturation)
         self._loaded: dict[Part, LoadedSplit] = {}
         self._listed: dict[str, int] = {}
@@ -201,14 +218,23 @@ class PoseDataModule(L.LightningDataModule):
         """Crop and normalise on the device, jitter while training; intrinsics follow each image's crop."""
         if self.trainer is None or not self.trainer.training:
             corner: tuple[Tensor | int, Tensor | int] = center_corner(batch.image, self.crop)
-            image = center_crop(batch.image, self.crop)
+            image, quaternion = center_crop(batch.image, self.crop), batch.quaternion
         else:
             uniform = self._epoch_uniforms(self.trainer.current_epoch, batch.index.device)[batch.index]
             how = augmentations(batch.image, self.crop, self.jitter, uniform)
             corner = (how.top, how.left)
-            image = augment(batch.image, how, self.crop)
+            image, quaternion = augment(batch.image, how, self.crop), self._turned(batch, how)
         intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, *corner)
-        return replace(batch, image=image, intrinsics=intrinsics)
+        return replace(batch, image=image, quaternion=quaternion, intrinsics=intrinsics)
+
+    def _turned(self, batch: PoseBatch, how: Augmentations) -> Tensor:
+        """Rotations of cameras that look at the middle of their crop, as an image's does at its centre crop's."""
+        if self.hparams["focal_ratio"] is None:
+            return batch.quaternion
+        focal_px = self.hparams["focal_ratio"] * batch.image.shape[-1]
+        top, left = center_corner(batch.image, self.crop)
+        turn = turn_towards((how.left - left) / focal_px, (how.top - top) / focal_px)
+        return canonical(multiply(batch.quaternion, turn))
 
     def _epoch_uniforms(self, epoch: int, device: torch.device) -> Tensor:
         """An epoch's chances of every training frame, drawn and sent to the device once."""

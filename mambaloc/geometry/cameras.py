@@ -11,6 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from mambaloc.geometry.rotations import multiply
+
 
 def project(points_cam_m: Tensor, intrinsics: Tensor) -> Tensor:
     """Pixels that points in camera coordinates fall on; meaningless unless their depth, ``z``, is positive.
@@ -20,6 +22,20 @@ def project(points_cam_m: Tensor, intrinsics: Tensor) -> Tensor:
     """
     homogeneous = (intrinsics * points_cam_m[..., None, :]).sum(dim=-1)  # no matmul: TF32 and autocast would round it
     return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+def turn_towards(x: Tensor, y: Tensor) -> Tensor:
+    """Turn a camera, about its y and then its x axis, so that it looks along the ray ``(x, y, 1)``.
+
+    Shape:
+        (...), (...) -> (..., 4), ``cam_from_turned``.
+    """
+    yaw = torch.atan(x)
+    pitch = -torch.atan(y * yaw.cos())
+    zero = torch.zeros_like(yaw)
+    about_y = torch.stack(((yaw / 2).cos(), zero, (yaw / 2).sin(), zero), dim=-1)
+    about_x = torch.stack(((pitch / 2).cos(), (pitch / 2).sin(), zero, zero), dim=-1)
+    return multiply(about_y, about_x)
 
 
 def resized_intrinsics(intrinsics: Tensor, scale_x: float, scale_y: float) -> Tensor:
