@@ -40,8 +40,8 @@ def _speed(args: argparse.Namespace) -> None:
     for overlay in args.overlay:
         setting = setting.with_overlay(overlay)
     cuda = setting.device.index if setting.device.type == "cuda" else None
-    repetitions = {"steps": args.steps, "repetitions": args.repetitions, "workers": args.workers}
-    report = benchmark.measure_all(setting, args.batches, args.frames, **repetitions)
+    counts = {"steps": args.steps, "repetitions": args.repetitions, "workers": args.workers}
+    report = benchmark.measure_all(setting, args.batches, args.frames, **counts, sought_m=args.reach)
     benchmark.print_report(report, _machine(cuda))
     if args.out:
         benchmark.write_report(report, args.out, _machine(cuda))
@@ -102,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     part.add_argument("--steps", type=int, default=4, help="of a repetition")
     part.add_argument("--repetitions", type=int, default=5)
     part.add_argument("--workers", type=int, default=2, help="loader processes of the reference")
+    part.add_argument("--reach", type=float, metavar="METRES", help="train a process until then, and to the end")
     part.add_argument("--out", type=Path, help="a .json file for every figure")
     part.set_defaults(call=_speed)
     part = parts.add_parser("scenes", help="what scenes cost to load whole: seconds, memory, disk")

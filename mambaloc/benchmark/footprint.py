@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import lightning as L
 import numpy as np
@@ -22,6 +22,8 @@ from mambaloc.benchmark.reference import Published, ReferenceLoop
 from mambaloc.benchmark.speed import OURS, REFERENCE, Setting, now
 from mambaloc.console import quieten
 from mambaloc.models.transposenet import LitTransPoseNet
+
+Measured = TypeVar("Measured")
 
 _STATUS = Path("/proc/self/status")
 
@@ -79,7 +81,7 @@ def exponent(frames: Sequence[int], costs: Sequence[float]) -> float:
     return float(np.polyfit(np.log(frames), np.log(costs), 1)[0])
 
 
-def in_a_process(measure: Callable[..., Footprint], *args: Any) -> Footprint:
+def in_a_process(measure: Callable[..., Measured], *args: Any) -> Measured:
     """Run a measurement in a new process, which begins with none of this one's memory."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=quieten) as pool:
         return pool.submit(measure, *args).result()

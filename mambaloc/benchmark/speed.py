@@ -78,9 +78,12 @@ class Setting:
         """Whether forward passes run in bfloat16."""
         return self.trainer.get("precision") == "bf16-mixed"
 
-    def fit(self, system: LitPoseRegressor, data: PoseDataModule, callback: L.Callback, **limits: Any) -> None:
-        """Train with nothing beside the callback."""
-        _trainer(self, callbacks=[callback], num_sanity_val_steps=0, limit_val_batches=0, **limits).fit(system, data)
+    def fit(self, system: LitPoseRegressor, data: PoseDataModule, callback: L.Callback, **options: Any) -> L.Trainer:
+        """Train with nothing beside the callback, and without validation unless told."""
+        options = {"num_sanity_val_steps": 0, "limit_val_batches": 0, **options}
+        trainer = _trainer(self, callbacks=[callback], **options)
+        trainer.fit(system, data)
+        return trainer
 
 
 @dataclass(frozen=True)

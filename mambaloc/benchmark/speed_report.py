@@ -18,6 +18,7 @@ from mambaloc.benchmark.loading import LoadingRates, measure_loading
 from mambaloc.benchmark.report import new_table
 from mambaloc.benchmark.savings import SAVINGS, Savings, measure_savings
 from mambaloc.benchmark.speed import LOOP_ALONE, OURS, PARTS, REFERENCE, Setting, Speed, measure_speed, ratio
+from mambaloc.benchmark.whole_training import WholeTraining, measure_whole_training
 from mambaloc.files import writing
 from mambaloc.models.registry import model_class
 from mambaloc.models.transposenet import LitTransPoseNet
@@ -35,6 +36,7 @@ class SpeedReport:
         floors: of a step.
         footprints: memory and seconds to the first step.
         scaling: the same for whole epochs, by frames.
+        whole: a training to its end, if an error was sought.
     """
 
     setting: Setting
@@ -44,6 +46,7 @@ class SpeedReport:
     floors: Floors
     footprints: list[Footprint]
     scaling: list[Footprint]
+    whole: WholeTraining | None = None
 
 
 def measure_all(
@@ -53,6 +56,7 @@ def measure_all(
     steps: int = 4,
     repetitions: int = 5,
     workers: int = 2,
+    sought_m: float | None = None,
 ) -> SpeedReport:
     """Measure everything, one thing after another.
 
@@ -63,6 +67,7 @@ def measure_all(
         steps: of a repetition.
         repetitions: timed, after one that warms up.
         workers: loader processes of the reference.
+        sought_m: median position error to train a process from its start for, if any.
 
     Raises:
         InputError: for too few repetitions to tell a spread, or a scene with too few frames.
@@ -74,7 +79,9 @@ def measure_all(
     savings = measure_savings(setting, batch, repetitions) if published else None
     floors = measure_floors(setting, batch, repetitions)
     loading = measure_loading(setting.build()[1], repetitions=repetitions)
-    return SpeedReport(setting, speed, loading, savings, floors, footprints, measure_scaling(setting, frames))
+    scaling = measure_scaling(setting, frames)
+    whole = None if sought_m is None else measure_whole_training(setting, sought_m)
+    return SpeedReport(setting, speed, loading, savings, floors, footprints, scaling, whole)
 
 
 def print_report(report: SpeedReport, machine: str) -> None:
@@ -87,6 +94,8 @@ def print_report(report: SpeedReport, machine: str) -> None:
     print_footprints(report.footprints, console)
     if report.scaling:
         print_scaling(report.scaling, console)
+    if report.whole:
+        print_whole_training(report.whole, console)
     console.print(f"{report.setting.system}, medians; {machine}", soft_wrap=True)
 
 
@@ -182,3 +191,15 @@ def print_scaling(footprints: Sequence[Footprint], console: Console) -> None:
     frames = [each.frames for each in footprints]
     fits = (exponent(frames, costs) for costs in ([e.epoch_s for e in footprints], [e.host_bytes for e in footprints]))
     console.print("seconds grow as frames to the {:.2f}, host memory to the {:.2f}".format(*fits))
+
+
+def print_whole_training(whole: WholeTraining, console: Console) -> None:
+    """Print seconds from the start of a process to its error and its end."""
+    reached = "was not reached" if whole.reached_s is None else f"after {whole.reached_s:.1f} s"
+    frames = "THE TEST SET" if whole.selection == "test_set" else f"validation frames ({whole.selection})"
+    console.print(
+        f"a process that trains on {whole.frames} frames: first step after {whole.first_step_s:.1f} s, "
+        f"{whole.sought_m} m on {frames} {reached}, {whole.steps} steps after {whole.ended_s:.1f} s: {whole.position_error_m:.3f} m, "
+        f"{whole.rotation_error_deg:.2f} deg; validation is not counted",
+        soft_wrap=True,
+    )

@@ -124,7 +124,7 @@ class PoseDataModule(L.LightningDataModule):
         self._loaded: dict[Part, LoadedSplit] = {}
         self._listed: dict[str, int] = {}
         self._resident: dict[Part, CachedFrames] = {}
-        self._uniforms: tuple[tuple[int, int], Tensor] | None = None
+        self._uniforms: tuple[tuple[int, int, torch.device], Tensor] | None = None
 
     @property
     def folder(self) -> Path:
@@ -238,9 +238,9 @@ class PoseDataModule(L.LightningDataModule):
 
     def _epoch_uniforms(self, epoch: int, device: torch.device) -> Tensor:
         """An epoch's chances of every training frame, drawn and sent to the device once."""
-        drawn_for = (provenance.seed(), epoch)
+        drawn_for = (provenance.seed(), epoch, device)
         if self._uniforms is None or self._uniforms[0] != drawn_for:
-            uniforms = draw_uniforms(*drawn_for, len(self._loaded["train"].data.frames))
+            uniforms = draw_uniforms(provenance.seed(), epoch, len(self._loaded["train"].data.frames))
             self._uniforms = (drawn_for, uniforms.to(device))
         return self._uniforms[1]
 
@@ -335,10 +335,10 @@ class PoseDataModule(L.LightningDataModule):
 
     def _data(self, part: Part) -> CachedFrames:
         """A part's frames, in the device's memory if they are to be there."""
-        if part in self._resident:
-            return self._resident[part]
-        data = self._loaded[part].data
+        data, resident = self._loaded[part].data, self._resident.get(part)
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        if resident is not None and resident.position_m.device == device:
+            return resident
         wanted = self.hparams["resident"]
         if wanted is None:
             wanted = device.type == "cuda" and 2 * data.images.nbytes <= torch.cuda.mem_get_info(device)[0]

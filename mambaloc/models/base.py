@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, get_args
@@ -54,7 +56,7 @@ class LitPoseRegressor(L.LightningModule):
         lr: learning rate of Adam, or its highest value.
         weight_decay: L2 penalty, never on loss weights nor on a state-space mixer's A and D.
         schedule: ``step`` cuts the learning rate; ``cosine`` lets it fall to nothing over the whole training;
-            ``one_cycle`` first lets it rise (Smith and Topin 2018). The last two need a given number of epochs.
+            ``one_cycle`` first lets it rise (Smith and Topin 2018). The last two need the training's length.
         lr_step_epochs: under ``step``, epochs between cuts: 100 indoors, 200 outdoors in the paper.
         lr_gamma: what a cut multiplies the learning rate by.
         normalise_position: regress positions relative to the training positions' mean and spread.
@@ -126,12 +128,19 @@ class LitPoseRegressor(L.LightningModule):
         return self.network(image)
 
     def setup(self, stage: str) -> None:
-        """Take the scene's position statistics before the first epoch, and compile what the epochs run."""
+        """Take the scene's position statistics before the first epoch, and compile what the epochs run.
+
+        Raises:
+            InputError: where nothing can compile it.
+        """
         if stage == "fit" and self.normalise_position:
             for module in self.network.modules():
                 if isinstance(module, PositionScale):
                     module.fit(self.scene_for("normalise_position").train_position_m)
         if stage == "fit" and self.compile_mode is not None:
+            on_cpu, compilers = self.trainer.strategy.root_device.type == "cpu", ("c++", "g++", "clang++", "cl")
+            if on_cpu and "CXX" not in os.environ and not any(map(shutil.which, compilers)):
+                raise InputError("model.compile_mode: needs a C++ compiler; install g++, or set it to null")
             # The function, not the module: the state dict keeps its names, and validation, whose predictions outlive
             # the step that a CUDA graph overwrites, runs without.
             self._compiled = torch.compile(self.network.forward, mode=self.compile_mode)

@@ -14,7 +14,8 @@ from mambaloc.benchmark.footprint import Footprint, exponent, peak_bytes
 from mambaloc.benchmark.reference import DecodedFrames, Published, ReferenceLoop
 from mambaloc.benchmark.savings import SAVINGS, gis_together
 from mambaloc.benchmark.speed import LOOP_ALONE, OURS, PARTS, REFERENCE, measure_speed, ratio
-from mambaloc.benchmark.speed_report import print_scaling
+from mambaloc.benchmark.speed_report import print_scaling, print_whole_training
+from mambaloc.benchmark.whole_training import measure_whole_training
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.models import create_model
@@ -191,6 +192,25 @@ def test_everything_is_measured_in_one_run(setting, tmp_path, capsys):
     assert told["setting"]["system"] == "mambaloc"
     with pytest.raises(InputError, match="cannot be written"):
         write_report(report, tmp_path / "nowhere/speed.json", "this machine")
+
+
+def test_a_whole_training_from_its_process_start(setting, capsys):
+    trained = Setting("mambaloc", {**setting.model, "lr": 1e-3}, {**setting.data, "keep_count": 5}, {"max_epochs": 2})
+    whole = measure_whole_training(trained, 100.0)
+    assert (whole.frames, whole.steps) == (5, 4)
+    assert 0 < whole.first_step_s < whole.reached_s < whole.ended_s
+    assert 0 < whole.position_error_m < 10
+    print_whole_training(whole, Console(highlight=False))
+    assert "100.0 m on validation frames (sequences) after " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("data", "trainer", "message"),
+    [({"validation": "none"}, {"max_steps": 1}, "needs frames to validate on"), ({}, {}, "needs an end")],
+)
+def test_a_training_that_reaches_nothing(data, trainer, message):
+    with pytest.raises(InputError, match=f"--reach: {message}"):
+        measure_whole_training(Setting("mambaloc", {}, data, trainer), 0.1)
 
 
 @pytest.mark.slow

@@ -66,6 +66,13 @@ def test_compiled_steps_have_the_losses_of_plain_ones(scenes):
     assert set(compiled[0].state_dict()) == set(plain[0].state_dict())
 
 
+def test_compiling_without_a_compiler(scenes, monkeypatch):
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(InputError, match=r"model\.compile_mode: needs a C\+\+ compiler"):
+        fit(scenes, {"compile_mode": "default"})
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize(
