@@ -198,8 +198,8 @@ def print_whole_training(whole: WholeTraining, console: Console) -> None:
     reached = "was not reached" if whole.reached_s is None else f"after {whole.reached_s:.1f} s"
     frames = "THE TEST SET" if whole.selection == "test_set" else f"validation frames ({whole.selection})"
     console.print(
-        f"a process that trains on {whole.frames} frames: first step after {whole.first_step_s:.1f} s, "
-        f"{whole.sought_m} m on {frames} {reached}, {whole.steps} steps after {whole.ended_s:.1f} s: {whole.position_error_m:.3f} m, "
-        f"{whole.rotation_error_deg:.2f} deg; validation is not counted",
+        f"a process that trains on {whole.frames} frames, validation not counted: first step after "
+        f"{whole.first_step_s:.1f} s; {whole.sought_m} m on {frames} {reached}; {whole.steps} steps after "
+        f"{whole.ended_s:.1f} s, with {whole.position_error_m:.3f} m, {whole.rotation_error_deg:.2f} deg",
         soft_wrap=True,
     )
