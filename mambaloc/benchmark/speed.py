@@ -124,12 +124,15 @@ def measure_speed(
         workers: loader processes of the reference.
 
     Raises:
-        InputError: for too few repetitions to tell a spread.
+        InputError: for too few repetitions to tell a spread, or a scene with too few frames.
     """
     if repetitions < 4:
         raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
     system, data = setting.build()
     data.setup("fit")
+    frames, most = len(data.frames("train")), max([data.hparams["batch_size"], *batches])
+    if steps * most > frames:
+        raise InputError(f"--steps {steps}: in batches of {most} they need more than the scene's {frames} frames")
     device = setting.device
     published = Published(system) if isinstance(system, LitTransPoseNet) else None
     loops = {REFERENCE: ReferenceLoop(system, data, published, steps, device, workers)}

@@ -154,6 +154,11 @@ def test_speed_needs_repetitions(setting):
         measure_speed(setting, repetitions=3)
 
 
+def test_speed_needs_frames(setting):
+    with pytest.raises(InputError, match="--steps 4: in batches of 8 they need more than the scene's 12 frames"):
+        measure_speed(setting, batches=[8], steps=4)
+
+
 def test_floors_count_operations_and_bytes(setting):
     few, many = (measure_floors(setting, batch, 4) for batch in (2, 4))
     assert many.flops == pytest.approx(2 * few.flops, rel=0.01)
