@@ -16,6 +16,7 @@ from jsonargparse import Namespace
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from mambaloc.callbacks import EarlyStopping, OnnxExport, PoseProgressBar, TrajectoryPlot, WallClock
 from mambaloc.console import exits_cleanly, quieten
@@ -145,7 +146,7 @@ def run_directory(config: Namespace) -> Path:
     """Name a run's folder: a resumed run's own, else ``trainer.default_root_dir``, else ``runs/RECIPE/TIME``.
 
     The processes that Lightning starts for a distributed run are told by the first one; those that SLURM starts name it
-    after their job.
+    after their job and its step.
     """
     if os.environ.get("LOCAL_RANK", "0") != "0" and _RUN_DIR in os.environ:
         return Path(os.environ[_RUN_DIR])
@@ -156,8 +157,11 @@ def run_directory(config: Namespace) -> Path:
         run_dir = Path(config.trainer.default_root_dir)
     else:
         name = "+".join(Path(str(recipe)).stem for recipe in config.config or []) or "run"
-        job = os.environ.get("SLURM_JOB_ID")
-        run_dir = Path("runs", name, f"job-{job}" if job else datetime.now().strftime("%Y%m%d-%H%M%S"))
+        if SLURMEnvironment.detect():  # processes that share a step of a job share a run
+            stamp = "job-{SLURM_JOB_ID}.{SLURM_STEP_ID}".format_map({"SLURM_STEP_ID": "0", **os.environ})
+        else:
+            stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+        run_dir = Path("runs", name, stamp)
     os.environ[_RUN_DIR] = str(run_dir)
     return run_dir
 

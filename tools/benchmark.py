@@ -6,6 +6,7 @@ from pathlib import Path
 from mambaloc import benchmark, list_models, provenance
 from mambaloc.console import exits_cleanly, quieten, thread_count
 from mambaloc.data import PoseDataModule
+from mambaloc.errors import InputError
 from mambaloc.matrix import Store, print_plan, read_matrix, run_matrix, write_report
 from mambaloc.models.registry import model_class
 from mambaloc.zoo.bundles import load_with_data
@@ -35,6 +36,8 @@ def _loading(args: argparse.Namespace) -> None:
 
 
 def _speed(args: argparse.Namespace) -> None:
+    if args.out and not args.out.parent.is_dir():
+        raise InputError(f"{args.out}: there is no folder {args.out.parent}; make it first")
     scene = {"dataset": args.dataset, "root": args.root, "scene": args.scene, "validation": "block"}
     setting = benchmark.Setting(model_class(args.system).registry_name, data=scene)
     for overlay in args.overlay:

@@ -98,15 +98,17 @@ def forward(system: LitPoseRegressor, frames: PoseBatch) -> Callable[[], object]
     return call
 
 
-def training_step(system: LitPoseRegressor, frames: PoseBatch) -> Callable[[], object]:
-    """Forward, loss, backward and optimiser step."""
+def training_step(system: LitPoseRegressor, frames: PoseBatch, half: bool = False) -> Callable[[], object]:
+    """Forward, loss, backward and optimiser step, the first two in bfloat16 where it serves if ``half``."""
     optimizer = system.configure_optimizers()["optimizer"]
 
     def call() -> None:
         system.train()
         system.loss.train(frames.clip_length > 1)  # a single image has no relative pose, which only training refuses
         optimizer.zero_grad()
-        system.loss(system(frames.image), frames).backward()
+        with torch.autocast(frames.image.device.type, torch.bfloat16, enabled=half):
+            loss = system.loss(system(frames.image), frames)
+        loss.backward()
         optimizer.step()
 
     return call

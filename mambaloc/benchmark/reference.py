@@ -20,6 +20,7 @@ from torchvision import transforms
 
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datamodule import Part
+from mambaloc.errors import InputError
 from mambaloc.models import LitPoseRegressor
 from mambaloc.models.transposenet import LitTransPoseNet
 from mambaloc.nn import GlobalInformationSelector
@@ -77,6 +78,7 @@ class Published(nn.Module):
         every_token: compute the last encoder layer for all tokens, of which one is read.
         scan: run GIS as a sequence of two through the general scan.
         torch_dropout: let PyTorch draw the other dropout's masks.
+        contiguous: keep images and weights as PyTorch lays them out, channels first.
 
     Shape:
         images (B, 3, H, W), normalised -> :class:`~mambaloc.types.PosePrediction`.
@@ -90,6 +92,7 @@ class Published(nn.Module):
         every_token: bool = True,
         scan: bool = True,
         torch_dropout: bool = True,
+        contiguous: bool = True,
     ) -> None:
         super().__init__()
         network: Any = deepcopy(system.network)
@@ -98,7 +101,8 @@ class Published(nn.Module):
         self.encoders = nn.ModuleList((network.position_encoder, network.orientation_encoder))
         self.gis = nn.ModuleList((network.position_gis, network.orientation_gis))
         self.head, self.every_token, self.scan = network.head, every_token, scan
-        self.to(memory_format=torch.contiguous_format)
+        self.layout = torch.contiguous_format if contiguous else torch.channels_last
+        self.backbone.to(memory_format=self.layout)
         layers: list[Any] = [module for module in self.modules() if isinstance(module, EncoderLayer)]
         for layer in layers:
             layer.attention_dropout = 0.1 if attention_dropout else 0.0
@@ -107,7 +111,7 @@ class Published(nn.Module):
 
     def forward(self, image: Tensor) -> PosePrediction:
         """Localise images."""
-        maps = self.backbone(image)
+        maps = self.backbone(image.contiguous(memory_format=self.layout))
         stride8_BCHW, stride16_BCHW = (maps[index] for index in self.maps)
         position_BD, orientation_BD = (
             self._select(gis, self._encode(encoder, feats))
@@ -151,6 +155,9 @@ class ReferenceLoop:
         steps: of a call of :meth:`train`: no loader process decodes beyond them.
         device: where it runs.
         workers: loader processes.
+
+    Raises:
+        InputError: for a loss over clips or scene points, which its loader does not have.
     """
 
     def __init__(
@@ -162,6 +169,8 @@ class ReferenceLoop:
         device: torch.device,
         workers: int,
     ) -> None:
+        if data.hparams["clip_length"] > 1 or data.hparams["points_per_frame"] > 0:
+            raise InputError("speed: the reference loop knows no clips and no scene points; measure another system")
         backbone: Any = system.network.backbone
         scale = ([0.0] * 3, [1.0] * 3) if network is None else (backbone.pixel_mean, backbone.pixel_std)
         self.mean, self.std = (torch.as_tensor(values).flatten().tolist() for values in scale)
@@ -201,6 +210,8 @@ class ReferenceLoop:
             prediction = self.network(batch.image)
             mark("forward")
             loss = self.loss(prediction, batch)
+            for auxiliary in prediction.auxiliary:
+                loss = loss + 0.3 * self.loss(auxiliary, batch)
             mark("loss")
             loss.backward()
             mark("backward")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +23,7 @@ SAVINGS = {
     "every_token": "last encoder layer for the token alone",
     "scan": "GIS in its closed form",
     "torch_dropout": "a draw for four elements of a dropout's mask",
+    "contiguous": "channels last",
 }
 """By the argument of :class:`~mambaloc.benchmark.reference.Published` that leaves it out."""
 
@@ -31,7 +33,7 @@ class Savings:
     """Seconds of forward and backward passes, an entry a repetition, all in turns.
 
     Args:
-        ours: of our network.
+        ours: of our network, eager, fed with images that are normalised.
         left_out: of our network with one saving left out, by its name in :data:`SAVINGS`.
         published: with all of them left out.
         gis: of both branches' GIS; None where the system has none.
@@ -61,12 +63,13 @@ def measure_savings(setting: Setting, batch: int, repetitions: int = 5) -> Savin
     device = setting.device
     image = torch.rand(batch, 3, *data.crop, device=device)
     none: dict[str, bool] = dict.fromkeys(SAVINGS, False)
-    networks = [system.network, *(Published(system, **{**none, name: True}) for name in SAVINGS), Published(system)]
-    calls = [_pass(network.to(device).train(), (image,), setting) for network in networks]
-    blocks = system.network.position_gis, system.network.orientation_gis
+    forms = [none, *({**none, name: True} for name in SAVINGS), dict.fromkeys(SAVINGS, True)]
+    calls = [_pass(Published(system, **form).to(device).train(), (image,), device, setting.is_half) for form in forms]
+    blocks: list[Any] = [system.network.position_gis, system.network.orientation_gis]
     if isinstance(blocks[0], GlobalInformationSelector):
         feats = [torch.rand(batch, system.hparams["dim"], device=device, requires_grad=True) for _ in blocks]
-        calls += [_pass(form, (*blocks, *feats), setting) for form in (_apart, gis_together)]
+        inputs = (*(block.to(device).train() for block in blocks), *feats)
+        calls += [_pass(form, inputs, device, setting.is_half) for form in (_apart, gis_together)]
     with torch.random.fork_rng():
         ours, *rest = in_turns(calls, repetitions, device.type)
     left_out = dict(zip(SAVINGS, rest, strict=False))
@@ -94,11 +97,13 @@ def gis_together(
     return first_BD, second_BD
 
 
-def _pass(network: Callable[..., object], inputs: tuple[object, ...], setting: Setting) -> Callable[[], None]:
+def _pass(
+    network: Callable[..., object], inputs: tuple[object, ...], device: torch.device, half: bool
+) -> Callable[[], None]:
     """A forward and a backward pass."""
 
     def call() -> None:
-        with torch.autocast(setting.device.type, torch.bfloat16, enabled=setting.is_half):
+        with torch.autocast(device.type, torch.bfloat16, enabled=half):
             said = network(*inputs)
         first, second = said if isinstance(said, tuple) else (said.position_m, said.quaternion)  # type: ignore[attr-defined]
         (first.sum() + second.sum()).backward()

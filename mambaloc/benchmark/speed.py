@@ -75,12 +75,19 @@ class Setting:
 
     @property
     def is_half(self) -> bool:
-        """Whether forward passes run in bfloat16."""
-        return self.trainer.get("precision") == "bf16-mixed"
+        """Whether forward passes run in bfloat16.
+
+        Raises:
+            InputError: for a precision that is not measured here.
+        """
+        precision = self.trainer.get("precision", "32-true")
+        if precision not in ("32-true", "bf16-mixed"):
+            raise InputError(f"trainer.precision {precision}: speed is measured in 32-true or bf16-mixed")
+        return precision == "bf16-mixed"
 
     def fit(self, system: LitPoseRegressor, data: PoseDataModule, callback: L.Callback, **options: Any) -> L.Trainer:
         """Train with nothing beside the callback, and without validation unless told."""
-        options = {"num_sanity_val_steps": 0, "limit_val_batches": 0, **options}
+        options = {"num_sanity_val_steps": 0, "limit_val_batches": 0, "max_steps": -1, **options}
         trainer = _trainer(self, callbacks=[callback], **options)
         trainer.fit(system, data)
         return trainer
@@ -130,6 +137,10 @@ def measure_speed(
         raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
     system, data = setting.build()
     data.setup("fit")
+    if steps < 2:
+        raise InputError(f"--steps {steps}: the first warms up; give 2 or more")
+    if data.hparams["validation"] == "none":
+        raise InputError("speed: evaluation needs frames; set data.validation to block")
     frames, most = len(data.frames("train")), max([data.hparams["batch_size"], *batches])
     if steps * most > frames:
         raise InputError(f"--steps {steps}: in batches of {most} they need more than the scene's {frames} frames")

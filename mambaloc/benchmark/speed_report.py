@@ -18,7 +18,8 @@ from mambaloc.benchmark.loading import LoadingRates, measure_loading
 from mambaloc.benchmark.report import new_table
 from mambaloc.benchmark.savings import SAVINGS, Savings, measure_savings
 from mambaloc.benchmark.speed import LOOP_ALONE, OURS, PARTS, REFERENCE, Setting, Speed, measure_speed, ratio
-from mambaloc.benchmark.whole_training import WholeTraining, measure_whole_training
+from mambaloc.benchmark.whole_training import WholeTraining, check_whole_training, measure_whole_training
+from mambaloc.errors import InputError
 from mambaloc.files import writing
 from mambaloc.models.registry import model_class
 from mambaloc.models.transposenet import LitTransPoseNet
@@ -73,7 +74,8 @@ def measure_all(
         InputError: for too few repetitions to tell a spread, or a scene with too few frames.
     """
     batch = setting.data.get("batch_size", 8)
-    footprints = measure_footprints(setting, steps, workers)  # first: a wrong setting is told in seconds
+    _check(setting, frames, repetitions, sought_m)
+    footprints = measure_footprints(setting, steps, workers)
     speed = measure_speed(setting, batches, steps, repetitions, workers)
     published = issubclass(model_class(setting.system), LitTransPoseNet)
     savings = measure_savings(setting, batch, repetitions) if published else None
@@ -82,6 +84,25 @@ def measure_all(
     scaling = measure_scaling(setting, frames)
     whole = None if sought_m is None else measure_whole_training(setting, sought_m)
     return SpeedReport(setting, speed, loading, savings, floors, footprints, scaling, whole)
+
+
+def _check(setting: Setting, frames: Sequence[int], repetitions: int, sought_m: float | None) -> None:
+    """Tell what is wrong before anything is measured, and build the frame cache, which is nobody's first step.
+
+    Raises:
+        InputError: for numbers that cannot be measured on this scene.
+    """
+    if repetitions < 4:
+        raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
+    if len(frames) == 1:
+        raise InputError(f"--frames {frames[0]}: how cost grows takes two numbers or more")
+    if sought_m is not None:
+        check_whole_training(setting)
+    setting.is_half  # noqa: B018  it tells a precision that is not measured
+    data = setting.build()[1]
+    data.setup("fit")
+    if max(frames, default=0) > len(data.frames("train")):
+        raise InputError(f"--frames {max(frames)}: the scene has {len(data.frames('train'))} to train on")
 
 
 def print_report(report: SpeedReport, machine: str) -> None:
@@ -113,7 +134,7 @@ def print_speed(speed: Speed, loading: LoadingRates, console: Console) -> None:
     _rates(table, "training", speed.training[OURS], speed.training[REFERENCE])
     if LOOP_ALONE in speed.training:
         _rates(table, "training, our network in it", speed.training[OURS], speed.training[LOOP_ALONE])
-    _rates(table, "evaluation", speed.evaluation[OURS], speed.evaluation[REFERENCE])
+    _rates(table, "evaluation, the reference one at a time", speed.evaluation[OURS], speed.evaluation[REFERENCE])
     console.print(table)
     best = max(speed.batches, key=lambda size: median(speed.batches[size]))
     rates = ", ".join(f"{size}: {median(found):.1f}" for size, found in speed.batches.items())

@@ -44,13 +44,22 @@ def measure_whole_training(setting: Setting, sought_m: float) -> WholeTraining:
     """Train as the setting says, from the start of a process to the last step.
 
     Raises:
+        InputError: where :func:`check_whole_training` says so.
+    """
+    check_whole_training(setting)
+    return in_a_process(_train, setting, time.time(), sought_m)
+
+
+def check_whole_training(setting: Setting) -> None:
+    """Tell whether a setting can be trained to its end.
+
+    Raises:
         InputError: where nothing is validated on, or no end is set.
     """
     if setting.data.get("validation") == "none":
         raise InputError("--reach: needs frames to validate on; add --overlay recipes/overlays/watched.yaml")
     if not {"max_steps", "max_epochs"} & set(setting.trainer):
         raise InputError("--reach: needs an end; add an overlay that sets trainer.max_steps or max_epochs")
-    return in_a_process(_train, setting, time.time(), sought_m)
 
 
 class _Clock(L.Callback):
@@ -88,7 +97,7 @@ class _Clock(L.Callback):
 def _train(setting: Setting, started_at: float, sought_m: float) -> WholeTraining:
     system, data = setting.build()
     clock = _Clock(started_at, sought_m)
-    trainer = setting.fit(system, data, clock, limit_val_batches=1.0)
+    trainer = setting.fit(system, data, clock, limit_val_batches=1.0, max_steps=setting.trainer.get("max_steps", -1))
     (errors,) = trainer.validate(system, data, verbose=False)
     assert clock.first_step_s is not None
     return WholeTraining(

@@ -341,7 +341,10 @@ class PoseDataModule(L.LightningDataModule):
             return resident
         wanted = self.hparams["resident"]
         if wanted is None:
-            wanted = device.type == "cuda" and 2 * data.images.nbytes <= torch.cuda.mem_get_info(device)[0]
+            needed = sum(
+                loaded.data.images.nbytes for name, loaded in self._loaded.items() if name not in self._resident
+            )
+            wanted = device.type == "cuda" and 2 * needed <= torch.cuda.mem_get_info(device)[0]
         if not wanted:
             return data
         self._resident[part] = data.to(device)

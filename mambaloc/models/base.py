@@ -49,7 +49,8 @@ class LitPoseRegressor(L.LightningModule):
         loss: name in ``mambaloc.losses.LOSSES``.
         loss_args: that loss's arguments.
         compile_mode: run training steps through ``torch.compile`` in this mode: ``default``, or ``reduce-overhead``,
-            which replays CUDA graphs. It takes a minute or so before the first step, less where it was done before.
+            which replays CUDA graphs. It takes a minute or so before the first step, and before the first of another
+            size, as an epoch's last may be; less where it was done before.
         frozen_groups: layer groups of the backbone, from the image on, that stay as they start, statistics included.
         frozen_statistics: normalise by the statistics that the backbone starts with, in all of it: for one trained on
             many more images than the scene has.
@@ -94,6 +95,8 @@ class LitPoseRegressor(L.LightningModule):
         self.lr, self.weight_decay, self.lr_step_epochs, self.lr_gamma = lr, weight_decay, lr_step_epochs, lr_gamma
         if schedule not in get_args(Schedule):
             raise InputError(f"model.schedule {schedule!r}: choose one of {', '.join(get_args(Schedule))}")
+        if compile_mode not in (None, *get_args(CompileMode)):
+            raise InputError(f"model.compile_mode {compile_mode!r}: choose one of {', '.join(get_args(CompileMode))}")
         self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode
         self._compiled: Callable[[Tensor], PosePrediction] | None = None
         self.val_errors, self.test_errors = PoseErrors(), PoseErrors()
@@ -138,9 +141,13 @@ class LitPoseRegressor(L.LightningModule):
                 if isinstance(module, PositionScale):
                     module.fit(self.scene_for("normalise_position").train_position_m)
         if stage == "fit" and self.compile_mode is not None:
-            on_cpu, compilers = self.trainer.strategy.root_device.type == "cpu", ("c++", "g++", "clang++", "cl")
-            if on_cpu and "CXX" not in os.environ and not any(map(shutil.which, compilers)):
+            if "CXX" not in os.environ and not any(map(shutil.which, ("c++", "g++", "clang++", "cl"))):
                 raise InputError("model.compile_mode: needs a C++ compiler; install g++, or set it to null")
+            if self.trainer.accumulate_grad_batches > 1 and self.compile_mode == "reduce-overhead":
+                raise InputError(
+                    "model.compile_mode reduce-overhead: a replayed graph overwrites gradients that are to be summed; "
+                    "set it to default, or trainer.accumulate_grad_batches to 1"
+                )
             # The function, not the module: the state dict keeps its names, and validation, whose predictions outlive
             # the step that a CUDA graph overwrites, runs without.
             self._compiled = torch.compile(self.network.forward, mode=self.compile_mode)
@@ -242,15 +249,28 @@ class LitPoseRegressor(L.LightningModule):
         if self.schedule == "step":
             by_epoch = lr_scheduler.StepLR(optimizer, self.lr_step_epochs, self.lr_gamma)
             return {"optimizer": optimizer, "lr_scheduler": by_epoch}
-        steps = self.trainer.estimated_stepping_batches
-        if math.isinf(steps):
-            raise InputError(f"model.schedule {self.schedule}: needs the training's length; set trainer.max_epochs")
+        steps = self._steps_in_all()
         by_step: lr_scheduler.LRScheduler
         if self.schedule == "cosine":
-            by_step = lr_scheduler.CosineAnnealingLR(optimizer, int(steps))
+            by_step = lr_scheduler.CosineAnnealingLR(optimizer, steps)
         else:
-            by_step = lr_scheduler.OneCycleLR(optimizer, self.lr, int(steps), cycle_momentum=False)
+            by_step = lr_scheduler.OneCycleLR(optimizer, self.lr, steps, cycle_momentum=False)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": by_step, "interval": "step"}}
+
+    def _steps_in_all(self) -> int:
+        """Steps of the whole training, which a schedule spans.
+
+        Lightning's own estimate starts the loaders, before a resumed run has told them its epoch.
+        """
+        trainer = self.trainer
+        batches, limit = len(self.scene_for("schedule").train_dataloader()), trainer.limit_train_batches
+        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+        ends = [] if trainer.max_steps == -1 else [trainer.max_steps]
+        if trainer.max_epochs not in (None, -1):
+            ends.append(trainer.max_epochs * math.ceil(batches / trainer.accumulate_grad_batches))
+        if not ends:
+            raise InputError(f"model.schedule {self.schedule}: needs the training's length; set trainer.max_epochs")
+        return min(ends)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Write which system this is and where it was trained."""
@@ -265,8 +285,20 @@ class LitPoseRegressor(L.LightningModule):
             checkpoint["mambaloc"]["data"] = data.describe()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Remember where the checkpoint came from."""
+        """Remember where the checkpoint came from.
+
+        Raises:
+            InputError: where a training goes on under a schedule that was made for another length.
+        """
         self.provenance = checkpoint.get("mambaloc", {})
+        if self._trainer is not None and self.trainer.state.fn == "fit" and self.schedule != "step":
+            for state in checkpoint["lr_schedulers"]:
+                spans, needed = state.get("total_steps", state.get("T_max")), self._steps_in_all()
+                if spans != needed:
+                    raise InputError(
+                        f"--ckpt_path: its schedule spans {spans} steps, this training {needed}; keep its length, or "
+                        "start from its weights with model.warm_start"
+                    )
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import timm
 import torch
@@ -45,6 +45,7 @@ class ImageBackbone(nn.Module):
     ) -> None:
         super().__init__()
         self.name, self.body = name, body
+        self._fixed: list[nn.Module] = []
         if weights is not None:
             self._load(Path(weights))
         self.register_buffer("pixel_mean", torch.tensor(pixel_mean).view(3, 1, 1))
@@ -60,6 +61,13 @@ class ImageBackbone(nn.Module):
         """What the body sees of an image in 0..1."""
         return ((image - self.pixel_mean) / self.pixel_std).contiguous(memory_format=torch.channels_last)
 
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode, but of what is frozen."""
+        super().train(mode)
+        for module in self._fixed:
+            module.eval()
+        return self
+
     def freeze(self, groups: int) -> None:
         """Keep the first layer groups, from the image on, as they are: weights, and batch-norm statistics.
 
@@ -74,13 +82,11 @@ class ImageBackbone(nn.Module):
         for group in sorted(names)[:groups]:
             for name in names[group]:
                 self.model.get_parameter(name).requires_grad_(False)
-                self.model.get_submodule(name.rpartition(".")[0]).eval()
+                self._fixed.append(self.model.get_submodule(name.rpartition(".")[0]).eval())
 
     def freeze_statistics(self) -> None:
         """Let every batch norm use, and keep, the statistics that it has."""
-        for module in self.modules():
-            if isinstance(module, _BatchNorm):
-                module.eval()
+        self._fixed += [module.eval() for module in self.modules() if isinstance(module, _BatchNorm)]
 
     def _load(self, path: Path) -> None:
         if path.suffix != ".safetensors":

@@ -22,7 +22,8 @@ class Dropout(nn.Dropout):
     def forward(self, input: Tensor) -> Tensor:
         """Zero elements at random and scale the others up while training; change nothing otherwise."""
         dropped = round(self.p * _CHANCES)
-        if not self.training or input.device.type != "cpu" or not 0 < dropped < _CHANCES:
+        fast = input.device.type == "cpu" and not torch.compiler.is_compiling()  # which knows no random_
+        if not (fast and self.training and 0 < dropped < _CHANCES):
             return super().forward(input)
         draws = torch.empty(-(-input.numel() // _PER_DRAW), dtype=torch.int64).random_(-(2**63), None)
         chances = draws.view(torch.int16)[: input.numel()].view(input.shape)

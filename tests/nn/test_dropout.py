@@ -54,3 +54,9 @@ def test_outside_training_and_at_the_ends_it_is_pytorchs(p):
 def test_it_works_on_an_empty_batch_and_in_bfloat16():
     assert Dropout(0.1)(torch.ones(0, 5)).shape == (0, 5)
     assert Dropout(0.1)(torch.ones(4, 5, dtype=torch.bfloat16)).dtype == torch.bfloat16
+
+
+def test_compiling_takes_it_whole():
+    torch.manual_seed(0)
+    compiled = torch.compile(Dropout(0.5), fullgraph=True, backend="eager")
+    assert (compiled(torch.ones(100, 100)) == 0).float().mean().item() == pytest.approx(0.5, abs=0.05)

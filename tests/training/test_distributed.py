@@ -60,9 +60,9 @@ def test_two_nodes_of_slurms(recipe, tmp_path):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     job = {
-        "SLURM_JOB_ID": "7", "SLURM_JOB_NAME": "train", "SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "1",
-        "SLURM_NODELIST": "127.0.0.1", "SLURM_LOCALID": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port),
-        "GLOO_SOCKET_IFNAME": "lo",
+        "SLURM_JOB_ID": "7", "SLURM_STEP_ID": "3", "SLURM_JOB_NAME": "train", "SLURM_NTASKS": "2",
+        "SLURM_NTASKS_PER_NODE": "1", "SLURM_NODELIST": "127.0.0.1", "SLURM_LOCALID": "0",
+        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "GLOO_SOCKET_IFNAME": "lo",
     }  # fmt: skip
     words = [*TRAIN, recipe, "--trainer.num_nodes", "2", "--trainer.devices", "1"]
     tasks = [
@@ -77,4 +77,4 @@ def test_two_nodes_of_slurms(recipe, tmp_path):
     ]
     said = [task.communicate(timeout=240)[1] for task in tasks]
     assert [task.returncode for task in tasks] == [0, 0], said
-    assert_one_training(tmp_path / "runs/distributed/job-7", recipe, tmp_path)
+    assert_one_training(tmp_path / "runs/distributed/job-7.3", recipe, tmp_path)

@@ -100,6 +100,8 @@ class NoWaiting(L.Callback):
     def on_train_epoch_end(self, *_):
         torch.cuda.set_sync_debug_mode("default")
 
+    on_exception = on_train_epoch_end
+
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -126,6 +128,8 @@ def test_a_schedule_spans_the_whole_training(scenes, schedule):
 def test_a_schedule_needs_to_know_how_long(scenes):
     with pytest.raises(InputError, match=r"model\.schedule cosine: needs the training's length"):
         fit(scenes, {"schedule": "cosine"}, max_epochs=-1)
+    with pytest.raises(InputError, match=r"model\.compile_mode 'fastest': choose one of default, reduce-overhead"):
+        create_model("mambaloc", compile_mode="fastest")
     with pytest.raises(InputError, match=r"model\.schedule 'linear': choose one of step, cosine, one_cycle"):
         create_model("mambaloc", schedule="linear")
 
@@ -175,6 +179,19 @@ def test_averaged_weights_are_what_a_run_leaves_and_resumes(tiny_recipe, tmp_pat
         torch.testing.assert_close(states[0][part], states[1][part], rtol=0, atol=0)
     head = "network.head.position.0.weight"
     assert not torch.equal(states[0]["state_dict"][head], states[0]["current_model_state"][head])
+
+
+def test_a_schedule_made_for_another_length_is_not_gone_on_with(tiny_recipe, tmp_path):
+    words = ["--model.schedule", "one_cycle", "--trainer.max_epochs"]
+    main([str(tiny_recipe), "--trainer.default_root_dir", str(tmp_path / "run"), *words, "1"])
+    last = tmp_path / "run/checkpoints/last.ckpt"
+    with pytest.raises(SystemExit, match="2"):
+        main([str(tiny_recipe), "--ckpt_path", str(last), *words, "2"])
+
+
+def test_summed_gradients_are_no_graphs(scenes):
+    with pytest.raises(InputError, match="a replayed graph overwrites gradients"):
+        fit(scenes, {"compile_mode": "reduce-overhead"}, accumulate_grad_batches=2)
 
 
 class StopAfterTwo(L.Callback):

@@ -85,16 +85,3 @@ def test_every_system_takes_the_equal_budget(recipe, scenes, cambridge, teacher,
     cli = main([str(recipe), str(BLOCKS), *options, "--trainer.fast_dev_run", "1", "--data.batch_size", "2"])
     assert cli.model.hparams["backbone"] == "mobilenetv2_100"
     assert cli.trainer.state.finished
-
-
-def test_fast_recipe_is_the_papers_with_the_fast_overlay():
-    paper, overlay, fast = (
-        yaml.safe_load((REPOSITORY / "recipes" / name).read_text())
-        for name in ("mambaloc_7scenes.yaml", "overlays/fast.yaml", "mambaloc_7scenes_fast.yaml")
-    )
-    model = {**paper["model"]["init_args"], **overlay["model"]["init_args"]}
-    assert fast["model"] == {"class_path": paper["model"]["class_path"], "init_args": model}
-    assert fast["data"] == {**paper["data"], **overlay["data"]}
-    assert {name: fast[name] for name in overlay if name not in ("model", "data")} == {
-        name: overlay[name] for name in overlay if name not in ("model", "data")
-    }
