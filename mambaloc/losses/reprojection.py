@@ -43,8 +43,9 @@ class Reprojection(nn.Module):
         points_m = torch.where(is_point[..., None], target.points_m, 0.0)  # a NaN would reach every gradient
         true_px, is_in_front = _seen_by(target.position_m, target.quaternion, points_m, target.intrinsics)
         height, width = target.image.shape[-2:]
-        corner = true_px.new_tensor([width, height]) - 0.5  # pixel centres are whole numbers
-        visible = is_point & is_in_front & ((true_px >= -0.5) & (true_px <= corner)).all(dim=-1)
+        x_px, y_px = true_px.unbind(dim=-1)  # pixel centres are whole numbers
+        in_view = (x_px >= -0.5) & (x_px <= width - 0.5) & (y_px >= -0.5) & (y_px <= height - 0.5)
+        visible = is_point & is_in_front & in_view
 
         predicted_px, _ = _seen_by(prediction.position_m, prediction.quaternion, points_m, target.intrinsics)
         distance_px = (predicted_px - true_px).abs().sum(-1).clamp_max(self.clip_px)
