@@ -158,7 +158,7 @@ def run_directory(config: Namespace) -> Path:
     else:
         name = "+".join(Path(str(recipe)).stem for recipe in config.config or []) or "run"
         if SLURMEnvironment.detect():  # processes that share a step of a job share a run
-            stamp = "job-{SLURM_JOB_ID}.{SLURM_STEP_ID}".format_map({"SLURM_STEP_ID": "0", **os.environ})
+            stamp = f"job-{os.environ['SLURM_JOB_ID']}.{os.environ.get('SLURM_STEP_ID', 0)}"
         else:
             stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         run_dir = Path("runs", name, stamp)

@@ -9,11 +9,10 @@ from statistics import median
 
 import cv2
 import torch
-from PIL import Image
 from rich.progress import track
 from torch import Tensor
-from torchvision import transforms
 
+from mambaloc.benchmark.reference import DecodedFrames
 from mambaloc.data import PoseDataModule
 from mambaloc.data.augmentation import augment, augmentations, draw_uniforms
 
@@ -84,19 +83,9 @@ def _cached(data: PoseDataModule) -> Callable[[list[int]], Tensor]:
 
 
 def _decoded(data: PoseDataModule) -> Callable[[list[int]], Tensor]:
-    paths = data.frames("train").image_paths
-    jitter = data.jitter
-    transform = transforms.Compose(
-        [
-            transforms.Resize(data.hparams["short_side"]),
-            transforms.RandomCrop(data.crop),
-            transforms.ColorJitter(jitter.brightness, jitter.contrast, jitter.saturation),
-            transforms.ToTensor(),
-            transforms.Normalize(_MEAN, _STD),
-        ]
-    )
+    frames = DecodedFrames(data, list(_MEAN), list(_STD))
 
     def load(indices: list[int]) -> Tensor:
-        return torch.stack([transform(Image.open(paths[i]).convert("RGB")) for i in indices])
+        return torch.stack([frames[i][0] for i in indices])
 
     return load

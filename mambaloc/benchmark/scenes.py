@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +11,7 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 from rich.progress import track
 
-from mambaloc.benchmark.footprint import peak_bytes
+from mambaloc.benchmark.footprint import in_a_process, peak_bytes
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets import DATASETS, scene_folder
 from mambaloc.data.frames import BadFrames, Split
@@ -78,11 +76,10 @@ def measure_scenes(dataset: str, root: Path, scenes: Sequence[str], short_side: 
         raise InputError(f"{root}: holds none of {', '.join(DATASETS[dataset].official_counts)}; name the scenes")
     kept = default_cache_dir()  # where the disk is that caches are for
     kept.mkdir(parents=True, exist_ok=True)
-    spawn = multiprocessing.get_context("spawn")  # a fork would begin with this process's memory
     found = []
     for name in track(names, "Loading scenes", console=Console(stderr=True), transient=True):
-        with ProcessPoolExecutor(1, mp_context=spawn) as pool, TemporaryDirectory(dir=kept) as cache:
-            found.append(pool.submit(_measure, dataset, root, name, short_side, cache).result())
+        with TemporaryDirectory(dir=kept) as cache:
+            found.append(in_a_process(_measure, dataset, root, name, short_side, cache))
     return found
 
 
