@@ -1,4 +1,4 @@
-"""Measure: tools/benchmark.py sizes|latency|loading|speed|scenes|deployment|run|report, each with --help."""
+"""Measure: tools/benchmark.py sizes|latency|loading|speed|cpu|scenes|deployment|run|report, each with --help."""
 
 import argparse
 from pathlib import Path
@@ -38,16 +38,26 @@ def _loading(args: argparse.Namespace) -> None:
 def _speed(args: argparse.Namespace) -> None:
     if args.out and not args.out.parent.is_dir():
         raise InputError(f"{args.out}: there is no folder {args.out.parent}; make it first")
-    scene = {"dataset": args.dataset, "root": args.root, "scene": args.scene, "validation": "block"}
-    setting = benchmark.Setting(model_class(args.system).registry_name, data=scene)
-    for overlay in args.overlay:
-        setting = setting.with_overlay(overlay)
+    setting = _setting(args)
     cuda = setting.device.index if setting.device.type == "cuda" else None
     counts = {"steps": args.steps, "repetitions": args.repetitions, "workers": args.workers}
     report = benchmark.measure_all(setting, args.batches, args.frames, **counts, sought_m=args.reach)
     benchmark.print_report(report, _machine(cuda))
     if args.out:
         benchmark.write_report(report, args.out, _machine(cuda))
+
+
+def _cpu(args: argparse.Namespace) -> None:
+    found = benchmark.measure_cpu_settings(_setting(args), args.threads, args.steps, args.repetitions)
+    benchmark.print_cpu_settings(found, args.threads, f"{args.system}, medians; {_machine()}")
+
+
+def _setting(args: argparse.Namespace) -> benchmark.Setting:
+    scene = {"dataset": args.dataset, "root": args.root, "scene": args.scene, "validation": "block"}
+    setting = benchmark.Setting(model_class(args.system).registry_name, data=scene)
+    for overlay in args.overlay:
+        setting = setting.with_overlay(overlay)
+    return setting
 
 
 def _scenes(args: argparse.Namespace) -> None:
@@ -96,10 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         part.add_argument(name, default=default)
     part.set_defaults(call=_loading)
     part = parts.add_parser("speed", help="where training time goes, beside the loop of published research code")
-    part.add_argument("system", nargs="?", default="mambaloc")
-    part.add_argument("--overlay", type=Path, action="append", default=[], help="as recipes/overlays/ holds them")
-    for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
-        part.add_argument(name, default=default)
+    _add_setting(part)
     part.add_argument("--batches", type=int, nargs="*", default=[16, 32], help="other numbers of images a step")
     part.add_argument("--frames", type=int, nargs="*", default=[], help="numbers of frames to train an epoch on")
     part.add_argument("--steps", type=int, default=4, help="of a repetition")
@@ -108,6 +115,12 @@ def _parser() -> argparse.ArgumentParser:
     part.add_argument("--reach", type=float, metavar="METRES", help="train a process until then, and to the end")
     part.add_argument("--out", type=Path, help="a .json file for every figure")
     part.set_defaults(call=_speed)
+    part = parts.add_parser("cpu", help="what ONNX Runtime's options and a training process's settings are worth")
+    _add_setting(part)
+    part.add_argument("--threads", type=thread_count, default=2, help="of ONNX Runtime")
+    part.add_argument("--steps", type=int, default=8, help="that are timed, of each process")
+    part.add_argument("--repetitions", type=int, default=5, help="processes a setting")
+    part.set_defaults(call=_cpu)
     part = parts.add_parser("scenes", help="what scenes cost to load whole: seconds, memory, disk")
     part.add_argument("root", type=Path, help="folder that holds them")
     part.add_argument("scenes", nargs="*", help="names; every official one that is there unless given")
@@ -134,6 +147,13 @@ def _parser() -> argparse.ArgumentParser:
     part.add_argument("--out", type=Path, help="folder to write; RESULTS/report unless given")
     part.set_defaults(call=_report)
     return parser
+
+
+def _add_setting(part: argparse.ArgumentParser) -> None:
+    part.add_argument("system", nargs="?", default="mambaloc")
+    part.add_argument("--overlay", type=Path, action="append", default=[], help="as recipes/overlays/ holds them")
+    for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
+        part.add_argument(name, default=default)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Measurements of the library itself: each a ratio taken in one run."""
 
+from mambaloc.benchmark.cpu_settings import SettingTimes, measure_cpu_settings, print_cpu_settings
 from mambaloc.benchmark.deployment import Deployment, measure_deployment
 from mambaloc.benchmark.latency import Latency, forward_flops, measure_latency
 from mambaloc.benchmark.loading import LoadingRates, measure_loading
@@ -15,14 +16,17 @@ __all__ = [
     "LoadingRates",
     "SceneCost",
     "Setting",
+    "SettingTimes",
     "Size",
     "SpeedReport",
     "forward_flops",
     "measure_all",
+    "measure_cpu_settings",
     "measure_deployment",
     "measure_latency",
     "measure_loading",
     "measure_scenes",
+    "print_cpu_settings",
     "print_deployments",
     "print_latencies",
     "print_loading",

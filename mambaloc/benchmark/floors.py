@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from statistics import median
 
@@ -105,6 +106,7 @@ def _kept_for_backward(system: LitPoseRegressor, image: Tensor) -> int:
 
 
 def _kernels(step: object, device: torch.device, shown: int = 8) -> list[tuple[str, float]]:
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # it calls a missing GPU an error, on stderr
     activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if device.type == "cuda" else [])]
     with profile(activities=activities) as profiled:
         step()  # type: ignore[operator]

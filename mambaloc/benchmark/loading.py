@@ -15,6 +15,7 @@ from torch import Tensor
 from mambaloc.benchmark.reference import DecodedFrames
 from mambaloc.data import PoseDataModule
 from mambaloc.data.augmentation import augment, augmentations, draw_uniforms
+from mambaloc.memory import keep_freed_memory
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -32,7 +33,7 @@ class LoadingRates:
         return median(self.cached) / median(self.decoded)
 
 
-def measure_loading(data: PoseDataModule, batches: int = 8, repetitions: int = 5) -> LoadingRates:
+def measure_loading(data: PoseDataModule, batches: int = 32, repetitions: int = 5) -> LoadingRates:
     """Time both ways from disk to a normalised, augmented float batch, alternating, after a warm-up of each.
 
     The reference is what published research code does: PIL, resize, random crop, colour jitter, normalise, a frame at
@@ -44,6 +45,7 @@ def measure_loading(data: PoseDataModule, batches: int = 8, repetitions: int = 5
         repetitions: timed repetitions of each way.
     """
     threads = torch.get_num_threads()
+    keep_freed_memory()  # as a training does
     data.setup("fit")
     try:
         torch.set_num_threads(1)

@@ -131,19 +131,10 @@ def measure_speed(
         workers: loader processes of the reference.
 
     Raises:
-        InputError: for too few repetitions to tell a spread, or a scene with too few frames.
+        InputError: where :func:`check_speed` says so.
     """
-    if repetitions < 4:
-        raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
     system, data = setting.build()
-    data.setup("fit")
-    if steps < 2:
-        raise InputError(f"--steps {steps}: the first warms up; give 2 or more")
-    if data.hparams["validation"] == "none":
-        raise InputError("speed: evaluation needs frames; set data.validation to block")
-    frames, most = len(data.frames("train")), max([data.hparams["batch_size"], *batches])
-    if steps * most > frames:
-        raise InputError(f"--steps {steps}: in batches of {most} they need more than the scene's {frames} frames")
+    check_speed(data, batches, steps, repetitions)
     device = setting.device
     published = Published(system) if isinstance(system, LitTransPoseNet) else None
     loops = {REFERENCE: ReferenceLoop(system, data, published, steps, device, workers)}
@@ -167,6 +158,24 @@ def measure_speed(
         images = min(steps * batch, len(data.frames("val")))
         evaluation = _evaluation(setting, system, data, loops[REFERENCE], images, repetitions)
     return Speed(batch, turns.rates, {batch: turns.rates[OURS], **others}, evaluation, parts)
+
+
+def check_speed(data: PoseDataModule, batches: Sequence[int], steps: int, repetitions: int) -> None:
+    """Tell whether a scene's speed can be measured; decodes its frames, which is nobody's first step.
+
+    Raises:
+        InputError: for too few repetitions to tell a spread, or a scene with too few frames.
+    """
+    if repetitions < 4:
+        raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
+    if steps < 2:
+        raise InputError(f"--steps {steps}: the first warms up; give 2 or more")
+    if data.hparams["validation"] == "none":
+        raise InputError("speed: evaluation needs frames; set data.validation to block")
+    data.setup("fit")
+    frames, most = len(data.frames("train")), max([data.hparams["batch_size"], *batches])
+    if steps * most > frames:
+        raise InputError(f"--steps {steps}: in batches of {most} they need more than the scene's {frames} frames")
 
 
 class _Turns(L.Callback):

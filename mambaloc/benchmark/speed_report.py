@@ -17,7 +17,17 @@ from mambaloc.benchmark.footprint import Footprint, exponent, measure_footprints
 from mambaloc.benchmark.loading import LoadingRates, measure_loading
 from mambaloc.benchmark.report import new_table
 from mambaloc.benchmark.savings import SAVINGS, Savings, measure_savings
-from mambaloc.benchmark.speed import LOOP_ALONE, OURS, PARTS, REFERENCE, Setting, Speed, measure_speed, ratio
+from mambaloc.benchmark.speed import (
+    LOOP_ALONE,
+    OURS,
+    PARTS,
+    REFERENCE,
+    Setting,
+    Speed,
+    check_speed,
+    measure_speed,
+    ratio,
+)
 from mambaloc.benchmark.whole_training import WholeTraining, check_whole_training, measure_whole_training
 from mambaloc.errors import InputError
 from mambaloc.files import writing
@@ -74,7 +84,8 @@ def measure_all(
         InputError: for too few repetitions to tell a spread, or a scene with too few frames.
     """
     batch = setting.data.get("batch_size", 8)
-    _check(setting, frames, repetitions, sought_m)
+    _check(setting, frames, sought_m)
+    check_speed(setting.build()[1], batches, steps, repetitions)
     footprints = measure_footprints(setting, steps, workers)
     speed = measure_speed(setting, batches, steps, repetitions, workers)
     published = issubclass(model_class(setting.system), LitTransPoseNet)
@@ -86,14 +97,12 @@ def measure_all(
     return SpeedReport(setting, speed, loading, savings, floors, footprints, scaling, whole)
 
 
-def _check(setting: Setting, frames: Sequence[int], repetitions: int, sought_m: float | None) -> None:
-    """Tell what is wrong before anything is measured, and build the frame cache, which is nobody's first step.
+def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> None:
+    """Tell what is wrong before anything is measured.
 
     Raises:
         InputError: for numbers that cannot be measured on this scene.
     """
-    if repetitions < 4:
-        raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
     if len(frames) == 1:
         raise InputError(f"--frames {frames[0]}: how cost grows takes two numbers or more")
     if sought_m is not None:
@@ -181,9 +190,10 @@ def print_floors(floors: Floors, console: Console) -> None:
     """Print how far a step is from the machine's rates, and its largest kernels."""
     rates = f"{floors.flops_per_s / 1e12:.3f} TFLOP/s, {floors.bytes_per_s / 1e9:.1f} GB/s"
     work = f"{floors.flops / 1e9:.1f} GFLOP, {floors.bytes / 1e9:.2f} GB"
-    console.print(f"a step on a batch that is there: {1000 * floors.step_s:.2f} ms; {work}; this machine: {rates}")
     console.print(
-        f"of the rate of operations it reaches {floors.of_operations:.0%}, of the bandwidth {floors.of_bytes:.0%}"
+        f"a step on a batch that is there: {1000 * floors.step_s:.2f} ms; {work}; this machine: {rates}\n"
+        f"of the rate of operations it reaches {floors.of_operations:.0%}, of the bandwidth {floors.of_bytes:.0%}",
+        soft_wrap=True,
     )
     table = new_table("Kernels of a step, by their own time", "kernel", "share")
     for name, share in floors.kernels:

@@ -21,6 +21,7 @@ from mambaloc import provenance
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.losses import build_loss
+from mambaloc.memory import keep_freed_memory
 from mambaloc.metrics import PoseErrors
 from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale
 from mambaloc.types import PoseBatch, PosePrediction, height_and_width
@@ -131,11 +132,13 @@ class LitPoseRegressor(L.LightningModule):
         return self.network(image)
 
     def setup(self, stage: str) -> None:
-        """Take the scene's position statistics before the first epoch, and compile what the epochs run.
+        """Take the scene's position statistics, and compile what the epochs run, before the first epoch.
 
         Raises:
             InputError: where nothing can compile it.
         """
+        if stage == "fit":
+            keep_freed_memory()
         if stage == "fit" and self.normalise_position:
             for module in self.network.modules():
                 if isinstance(module, PositionScale):
