@@ -24,6 +24,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.distillation import LitDistillation
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, print_table
+from mambaloc.files import read_yaml
 from mambaloc.models import LitPoseRegressor, list_models
 from mambaloc.models.base import read_checkpoint
 from mambaloc.models.registry import model_class
@@ -179,6 +180,7 @@ def recipe_arguments(argv: list[str]) -> list[str]:
     while words and words[0].endswith((".yaml", ".yml")):
         if not Path(words[0]).is_file():
             raise InputError(f"{words[0]}: no such recipe; see recipes/")
+        read_yaml(Path(words[0]), "see recipes/", "correct it")  # before a parser that expands whatever stands there
         recipes += ["--config", words[0]]
         words = words[1:]
     if not recipes:

@@ -12,6 +12,8 @@ from typing import Any
 
 from mambaloc.errors import InputError
 
+_MOST_VALUES = 10**6
+
 
 def sha256(path: Path) -> str:
     """Digest of a file."""
@@ -33,11 +35,25 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
     import yaml  # only here: exported models run without it
 
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if _expanded(data, {}) > _MOST_VALUES:
+            raise InputError(f"{path}: its aliases stand for more than {_MOST_VALUES} values; write them out")
+        return data
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); {broken}") from None
+
+
+def _expanded(value: Any, known: dict[int, int]) -> int:
+    """How many values it holds once each alias is written out."""
+    if not isinstance(value, dict | list):
+        return 1
+    if id(value) not in known:
+        known[id(value)] = _MOST_VALUES  # if it holds itself
+        items = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1 + sum(_expanded(item, known) for item in items)
+    return known[id(value)]
 
 
 @contextmanager

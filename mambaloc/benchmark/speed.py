@@ -54,12 +54,12 @@ class Setting:
         said = read_yaml(path, "see recipes/overlays/", "give an overlay, as recipes/overlays/ holds them")
         if not isinstance(said, dict) or not set(said) & {"model", "data", "trainer"}:
             raise InputError(f"{path}: says nothing of model, data or trainer; give one of recipes/overlays/")
-        model = (said.get("model") or {}).get("init_args") or {}
+        model = _section(path, said, "model")
         return replace(
             self,
-            model={**self.model, **model},
-            data={**self.data, **(said.get("data") or {})},
-            trainer={**self.trainer, **(said.get("trainer") or {})},
+            model={**self.model, **_section(path, model, "init_args")},
+            data={**self.data, **_section(path, said, "data")},
+            trainer={**self.trainer, **_section(path, said, "trainer")},
         )
 
     def build(self, **data: Any) -> tuple[LitPoseRegressor, PoseDataModule]:
@@ -91,6 +91,13 @@ class Setting:
         trainer = _trainer(self, callbacks=[callback], **options)
         trainer.fit(system, data)
         return trainer
+
+
+def _section(path: Path, said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    section = said.get(name) or {}
+    if not isinstance(section, dict) or not all(isinstance(key, str) for key in section):
+        raise InputError(f"{path}: {name} is no mapping of names; indent what belongs to it")
+    return section
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
 def _listed_sequences(split_file: Path) -> list[int]:
     if not split_file.is_file():
         raise InputError(f"{split_file}: missing; it lists the split's sequences, a line 'sequenceN' each")
-    numbers = []
+    numbers: dict[int, None] = {}  # in order, and found at once however many there are
     for row, line in enumerate(split_file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
         if not line.strip():
             continue
@@ -68,10 +68,10 @@ def _listed_sequences(split_file: Path) -> list[int]:
             raise InputError(f"{split_file}, line {row}: {line.strip()[:40]!r} is no 'sequenceN'; correct the line")
         if int(match[1]) in numbers:
             raise InputError(f"{split_file}, line {row}: lists sequence{int(match[1])} again; remove the line")
-        numbers.append(int(match[1]))
+        numbers[int(match[1])] = None
     if not numbers:
         raise InputError(f"{split_file}: lists no sequence; add lines 'sequence1', 'sequence2', ...")
-    return numbers
+    return list(numbers)
 
 
 def _posed_images(sequence: Path, bad: BadFrames) -> list[tuple[Path, NDArray[np.float64]]]:

@@ -69,10 +69,13 @@ def read_pose_table(path: Path, scene: str, layout: Layout) -> list[Shot]:
         rows = csv.DictReader(file)
         if missing := [name for name in _COLUMNS if name not in (rows.fieldnames or ())]:
             raise InputError(f"{path}, line 1: lacks the columns {','.join(missing)}; name them in the first line")
-        for row in rows:
-            scenes.add(row["scene"])
-            if row["scene"] == scene:
-                shots.append(_shot(row, layout, f"{path}, line {rows.line_num}"))
+        try:
+            for row in rows:
+                scenes.add(row["scene"])
+                if row["scene"] == scene:
+                    shots.append(_shot(row, layout, f"{path}, line {rows.line_num}"))
+        except csv.Error as error:  # a field without end
+            raise InputError(f"{path}, line {rows.line_num}: is no row of a CSV ({error}); correct it") from None
     if not shots:
         raise InputError(f"{path}: has no row of scene {scene!r}; choose one of {', '.join(sorted(map(str, scenes)))}")
     return shots

@@ -1,0 +1,141 @@
+"""What is interrupted: each makes something in a folder, checks what lies there, and makes it again."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from mambaloc.cli import main
+from mambaloc.data import PoseDataModule
+from mambaloc.data.cache import cached_frames
+from mambaloc.data.frames import BadFrames
+from mambaloc.evaluation import evaluate_checkpoint
+from mambaloc.export import contract_of, export_onnx, write_bundle
+from mambaloc.models.base import read_checkpoint
+from mambaloc.models.student import LitStudent
+from mambaloc.runtime import Localiser
+from mambaloc.runtime.bundle import verify_bundle
+from mambaloc.runtime.trajectory import write_tum
+from mambaloc.zoo import load
+from mambaloc.zoo.publishing import publish
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An operation that writes.
+
+    ``make(inputs, out)`` writes under ``out``; run again, it goes on from whatever is there. ``check(out)`` opens what
+    is there with the readers that a user's next command has, and says whether it is finished.
+    """
+
+    make: Callable[[Path, Path], object]
+    check: Callable[[Path], bool]
+
+
+def student():
+    torch.manual_seed(0)
+    system = LitStudent(backbone="resnet10t", width=16, image_size=(32, 40)).eval()
+    system.provenance = {"commit": "abc", "versions": {"torch": "2"}}
+    return system
+
+
+def scene(inputs):
+    return PoseDataModule("7scenes", str(inputs / "scenes"), "heads", image_size=(32, 40), short_side=36)
+
+
+def decode(inputs, out):
+    cached_frames(sorted((inputs / "scenes/heads").glob("*/*.png")), 24, BadFrames(), out / "cache")
+
+
+def check_cache(out):
+    caches = [folder for folder in out.glob("cache/frames/*") if folder.is_dir() and not folder.suffix]
+    for folder in caches:
+        images, meta = np.load(folder / "images.npy"), json.loads((folder / "meta.json").read_text())
+        assert len(images) == len(meta["rows"])
+        assert all(image.any() for image in images)
+    return bool(caches)
+
+
+def train(inputs, out):
+    last = out / "run/checkpoints/last.ckpt"
+    resumed = ["--ckpt_path", str(last)] if last.exists() else ["--trainer.default_root_dir", str(out / "run")]
+    main([str(inputs / "recipe.yaml"), *resumed])
+
+
+def check_run(out):
+    for path in out.glob("run/checkpoints/*.ckpt"):
+        read_checkpoint(path)
+    last = out / "run/checkpoints/last.ckpt"
+    return last.exists() and read_checkpoint(last)["epoch"] == 2
+
+
+def export(inputs, out):
+    system = student()
+    export_onnx(system, out / "model.onnx", contract_of(system, scene(inputs).hparams))
+
+
+def check_export(out):
+    path = out / "model.onnx"
+    if path.exists():
+        Localiser(path, 1).localise(np.zeros((40, 50, 3), np.uint8))
+    return path.exists()
+
+
+def bundle(inputs, out):
+    if not (out / "bundle").exists():
+        write_bundle(student(), scene(inputs), out / "bundle", ("onnx", "fp16"))
+
+
+def check_bundle(out):
+    if (out / "bundle").exists():
+        assert len(verify_bundle(out / "bundle", 1)) == 2
+    return (out / "bundle").exists()
+
+
+def release(inputs, out):
+    if not list((out / "zoo").glob("*.tiny")):
+        publish(inputs / "run/checkpoints/best.ckpt", "tiny", out / "zoo", "cpu")
+
+
+def check_release(out):
+    found = list((out / "zoo").glob("[!.]*"))
+    for folder in found:
+        load(f"local-dir:{folder}")
+    return bool(found)
+
+
+def evaluate(inputs, out):
+    evaluate_checkpoint(inputs / "run/checkpoints/best.ckpt", out=out / "results")
+
+
+def check_evaluation(out):
+    metrics = out / "results/metrics.json"
+    if metrics.exists():
+        json.loads(metrics.read_text())
+    if (picture := out / "results/trajectory.png").exists():
+        assert cv2.imread(str(picture)) is not None
+    return metrics.exists()
+
+
+def trajectory(inputs, out):
+    write_tum(out / "poses.tum", range(1000), np.zeros((1000, 3)), np.ones((1000, 4)))
+
+
+def check_trajectory(out):
+    path = out / "poses.tum"
+    return path.exists() and len(path.read_text().splitlines()) == 1001
+
+
+SUBJECTS = {
+    "decoding frames": Subject(decode, check_cache),
+    "training": Subject(train, check_run),
+    "export": Subject(export, check_export),
+    "bundle": Subject(bundle, check_bundle),
+    "publishing": Subject(release, check_release),
+    "evaluation": Subject(evaluate, check_evaluation),
+    "trajectory": Subject(trajectory, check_trajectory),
+}

@@ -1,0 +1,239 @@
+"""Every parser is fed damaged files: it reads them or says in one line what is wrong, and nothing else happens.
+
+A damaged file is a whole one after a few accidents: cut off, bytes changed, a piece taken out or said twice, a number
+replaced by one that no file should hold.
+"""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mambaloc.benchmark import Setting
+from mambaloc.cli import recipe_arguments
+from mambaloc.data import cambridge, seven_scenes
+from mambaloc.data.frames import BadFrames
+from mambaloc.data.rendering import read_pose_table
+from mambaloc.errors import InputError
+from mambaloc.images import decode_image
+from mambaloc.matrix import read_matrix
+from mambaloc.models.base import read_checkpoint
+from mambaloc.runtime import Contract, Localiser
+from mambaloc.zoo.loading import load_released
+from mambaloc.zoo.manifest import Manifest
+
+REPOSITORY = Path(__file__).parents[2]
+RELEASED = REPOSITORY / "zoo/student.embedded_room"
+STRANGE = [
+    b"nan",
+    b"inf",
+    b"-1",
+    b"1e999",
+    b"99999999999999999999",
+    b"",
+    b"\0",
+    b"../../x",
+    b"{}",
+    b"[[[[",
+    b"\xff\xfe",
+]
+
+
+LAUGHS = "\n".join(["a0: &a0 [x]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12))])
+POSES = "scene,split,image,x,y,z,qw,qx,qy,qz\n"
+
+
+@st.composite
+def damages(draw) -> Callable[[bytes], bytes]:
+    """One to three accidents, each at some share of a file's length."""
+    accidents = draw(
+        st.lists(
+            st.tuples(
+                st.sampled_from(["cut", "change", "remove", "repeat", "number"]),
+                st.floats(0, 1),
+                st.integers(1, 64),
+                st.sampled_from(STRANGE),
+                st.binary(min_size=1, max_size=4),
+            ),
+            min_size=1,
+            max_size=3,
+        )
+    )
+
+    def damage(data: bytes) -> bytes:
+        for how, where, length, strange, noise in accidents:
+            at = int(where * len(data))
+            if how == "cut":
+                data = data[:at]
+            elif how == "change":
+                data = data[:at] + noise + data[at + len(noise) :]
+            elif how == "remove":
+                data = data[:at] + data[at + length :]
+            elif how == "repeat":
+                data = data[:at] + data[at : at + length] * 2 + data[at + length :]
+            else:  # in place of a word
+                start = max(data.rfind(white, 0, at) for white in (b" ", b"\n", b",", b":")) + 1
+                ends = [end for white in (b" ", b"\n", b",", b":") if (end := data.find(white, at)) != -1]
+                data = data[:start] + strange + data[min(ends, default=len(data)) :]
+        return data
+
+    return damage
+
+
+@pytest.fixture(scope="module")
+def frames_7scenes(tmp_path_factory, scenes):
+    folder = shutil.copytree(scenes / "heads", tmp_path_factory.mktemp("hostile") / "heads")
+    return folder, [folder / "TrainSplit.txt", folder / "seq-01/frame-000000.pose.txt"]
+
+
+@pytest.fixture
+def fed(tries, tally, tmp_path):
+    """Feed a parser one whole file with damages, ``tries`` times or more."""
+
+    def feed(name: str, parse: Callable[[Path], object], target: Path) -> None:
+        whole = target.read_bytes()
+        parse(target)  # what is damaged is a whole file
+
+        @settings(max_examples=max(40, tries), deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+        @given(damages())
+        def attacked(damage):
+            target.write_bytes(damage(whole))
+            try:
+                parse(target)
+                outcome = "harmless, read"
+            except InputError as error:
+                outcome = "one line" if "\n" not in str(error) else "MORE LINES"
+            tally(f"{name}: damaged", outcome)
+            assert outcome != "MORE LINES"
+
+        try:
+            attacked()
+        finally:
+            target.write_bytes(whole)
+
+    return feed
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["split", "pose"])
+def test_7scenes(which, frames_7scenes, fed):
+    folder, files = frames_7scenes
+    fed(f"7-Scenes {files[which].name}", lambda _: seven_scenes.read_split(folder, "train", BadFrames()), files[which])
+
+
+def test_cambridge(tmp_path, fed):
+    lines = [f"seq1/frame{n:05d}.png {n} 2.5 -3 0.5 0.5 0.5 0.5" for n in range(4)]
+    for n in range(4):
+        (tmp_path / f"seq1/frame{n:05d}.png").parent.mkdir(exist_ok=True)
+        (tmp_path / f"seq1/frame{n:05d}.png").touch()
+    labels = tmp_path / "dataset_train.txt"
+    labels.write_text(
+        "\n".join(["Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", "", *lines])
+    )
+    fed("Cambridge labels", lambda _: cambridge.read_split(tmp_path, "train", BadFrames()), labels)
+
+
+def test_pose_table(tmp_path, fed):
+    table = tmp_path / "poses.csv"
+    rows = [f"heads,train,seq-01/frame-{n:06d}.color.png,{n},0.5,1,1,0,0,0" for n in range(4)]
+    table.write_text("\n".join(["scene,split,image,x,y,z,qw,qx,qy,qz", *rows]))
+    fed("pose table", lambda path: read_pose_table(path, "heads", "7scenes"), table)
+
+
+LABEL = "seq1/frame00001.png 1 2 3 1 0 0 0"
+
+
+@pytest.mark.parametrize(
+    ("name", "read", "content"),
+    [
+        ("TrainSplit.txt", seven_scenes.read_split, "\n".join(f"sequence{n}" for n in range(1, 10**6))),
+        ("TrainSplit.txt", seven_scenes.read_split, "sequence1" * 10**6),
+        ("TrainSplit.txt", seven_scenes.read_split, "\n" * 10**6),
+        ("dataset_train.txt", cambridge.read_split, "\n".join(["", "", "", *[LABEL] * 10**6])),
+        ("dataset_train.txt", cambridge.read_split, "\n\n\n" + "x" * 10**7),
+        ("poses.csv", lambda folder, *_: read_pose_table(folder / "poses.csv", "a", "7scenes"), POSES + "\n" * 10**6),
+        ("poses.csv", lambda folder, *_: read_pose_table(folder / "poses.csv", "a", "7scenes"), POSES + "a" * 10**6),
+        ("overlay.yaml", lambda folder, *_: Setting("mambaloc").with_overlay(folder / "overlay.yaml"), "[" * 10**5),
+        ("overlay.yaml", lambda folder, *_: Setting("mambaloc").with_overlay(folder / "overlay.yaml"), LAUGHS),
+        ("recipe.yaml", lambda folder, *_: recipe_arguments([str(folder / "recipe.yaml")]), LAUGHS),
+        ("recipe.yaml", lambda folder, *_: recipe_arguments([str(folder / "recipe.yaml")]), "model: &a [*a]"),
+        ("matrix.yaml", lambda folder, *_: read_matrix(folder / "matrix.yaml"), "a: {" * 10**5),
+    ],
+    ids=lambda value: value if isinstance(value, str) and len(value) < 20 else None,
+)
+def test_files_without_end(name, read, content, tmp_path, tally):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError) as told:
+        read(tmp_path, "train", BadFrames())
+    assert "\n" not in str(told.value)
+    assert len(str(told.value)) < 1000
+    tally(f"{name}: a million lines, or one without end", "one line")
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_pictures(suffix, scenes, tmp_path, fed):
+    import cv2
+
+    path = tmp_path / f"picture.{suffix}"
+    cv2.imwrite(str(path), cv2.imread(str(scenes / "heads/seq-01/frame-000000.color.png")))
+
+    def parse(file: Path) -> None:
+        if isinstance(found := decode_image(file.read_bytes()), str):
+            raise InputError(found)
+
+    fed(f"{suffix.upper()} picture", parse, path)
+
+
+def test_overlays(tmp_path, fed):
+    overlay = shutil.copy(REPOSITORY / "recipes/overlays/redkitchen_blocks.yaml", tmp_path)
+    fed("overlay", lambda path: Setting("mambaloc").with_overlay(path), Path(overlay))
+
+
+def test_matrices(tmp_path, fed):
+    matrix = shutil.copy(REPOSITORY / "recipes/matrices/redkitchen_blocks.yaml", tmp_path)
+    fed("matrix", read_matrix, Path(matrix))
+
+
+def test_manifests(tmp_path, fed):
+    folder = shutil.copytree(RELEASED, tmp_path / "released")
+    fed("manifest", lambda path: Manifest.read(path.parent), folder / "manifest.yaml")
+
+
+def test_released_weights(tmp_path, fed):
+    folder = shutil.copytree(RELEASED, tmp_path / "student.embedded_room")
+    fed("safetensors", lambda path: load_released(path.parent), folder / "weights.safetensors")
+
+
+def test_contracts(tmp_path, fed):
+    said = {
+        "contract": 1,
+        "model": "student",
+        "scene": "7scenes/heads",
+        "preprocessing": {"short_side": 36, "crop": [32, 40], "in_model": False},
+        "trained": {"commit": "abc"},
+        "weights_sha256": "0" * 64,
+        "pose": "world_from_cam",
+    }
+    path = tmp_path / "contract.json"
+    path.write_text(json.dumps(said, indent=1))
+    fed("contract", lambda file: Contract.from_json(file.read_bytes().decode(errors="replace"), str(file)), path)
+
+
+@pytest.mark.slow
+def test_checkpoints(tiny_recipe, tmp_path, fed):
+    from mambaloc.cli import main
+
+    main([str(tiny_recipe), "--trainer.max_epochs", "1", "--trainer.default_root_dir", str(tmp_path / "run")])
+    fed("checkpoint", read_checkpoint, tmp_path / "run/checkpoints/last.ckpt")
+
+
+@pytest.mark.slow
+def test_models(scenes, tmp_path, fed):
+    from subjects import export
+
+    (tmp_path / "scenes").symlink_to(scenes)
+    export(tmp_path, tmp_path)
+    fed("ONNX model", lambda path: Localiser(path, 1), tmp_path / "model.onnx")
