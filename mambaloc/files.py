@@ -70,6 +70,17 @@ def writing(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a file beside a path to write to, which gets its name once the block ends; an error leaves nothing."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
 def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
     """Give an empty folder to write to, which gets its name once the block ends; an error leaves nothing.
 

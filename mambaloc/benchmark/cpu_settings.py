@@ -25,7 +25,7 @@ from mambaloc.errors import InputError
 from mambaloc.export import contract_of, export_onnx
 
 AS_IT_IS = "as it is"
-_A_TURN = 4  # images: the session before lets its threads spin on into the first
+_A_TURN = 10  # images, after those that warm up
 
 
 def _entry(name: str, value: str) -> Callable[[SessionOptions], None]:
@@ -80,7 +80,7 @@ def measure_cpu_settings(setting: Setting, threads: int, steps: int = 8, repetit
         setting: what is trained on what; its network, as it starts, is what runs in ONNX Runtime.
         threads: of ONNX Runtime.
         steps: of an epoch of training, of which each process runs two, and the second is timed.
-        repetitions: processes a setting; of inference ten times as many calls.
+        repetitions: processes a setting; twice as many sessions.
 
     Raises:
         InputError: for too few repetitions to tell a spread, or a device that is no CPU.
@@ -89,7 +89,7 @@ def measure_cpu_settings(setting: Setting, threads: int, steps: int = 8, repetit
         raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
     if setting.device.type != "cpu":
         raise InputError("cpu: measures a CPU; leave recipes/overlays/gpu.yaml out")
-    inference = _inference(setting, threads, 10 * repetitions)
+    inference = _inference(setting, threads, 2 * repetitions)
     forms = _forms(setting)
     training: dict[str, list[float]] = {name: [] for name in forms}
     turns = [name for _ in range(repetitions) for name in forms]
@@ -123,18 +123,21 @@ def _forms(setting: Setting) -> dict[str, tuple[Setting, Mapping[str, str]]]:
 
 def _inference(setting: Setting, threads: int, repetitions: int) -> dict[str, list[float]]:
     system, data = setting.build()
+    image = torch.rand(1, 3, *data.crop).numpy()
+    found: dict[str, list[float]] = {name: [] for name in SESSIONS}
     with TemporaryDirectory() as folder:
         path = Path(folder, "model.onnx")
         export_onnx(system, path, contract_of(system, data.hparams))
-        sessions = {name: _session(path, threads, change) for name, change in SESSIONS.items()}
-    image = torch.rand(1, 3, *data.crop).numpy()
-    calls = [_repeated(session, image) for session in sessions.values()]
-    found = in_turns(calls, repetitions, "cpu")
-    return {name: [seconds / _A_TURN for seconds in taken] for name, taken in zip(sessions, found, strict=True)}
-
-
-def _repeated(session: onnxruntime.InferenceSession, image: object) -> Callable[[], object]:
-    return lambda: [session.run(None, {"image": image}) for _ in range(_A_TURN)]
+        names = list(SESSIONS)
+        firsts = [turn % len(names) for turn in range(repetitions)]
+        turns = [name for first in firsts for name in names[first:] + names[:first]]
+        for name in track(turns, "timing sessions", console=Console(stderr=True), transient=True):
+            # One session at a time: the threads of another would spin on for a while, and take a core.
+            session = _session(path, threads, SESSIONS[name])
+            taken = in_turns([lambda of=session: of.run(None, {"image": image})], _A_TURN, "cpu")  # type: ignore[misc]
+            found[name].append(median(taken[0]))
+            del session, taken
+    return found
 
 
 def _session(path: Path, threads: int, change: Callable[[SessionOptions], None]) -> onnxruntime.InferenceSession:

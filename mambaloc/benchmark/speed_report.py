@@ -30,7 +30,7 @@ from mambaloc.benchmark.speed import (
 )
 from mambaloc.benchmark.whole_training import WholeTraining, check_whole_training, measure_whole_training
 from mambaloc.errors import InputError
-from mambaloc.files import writing
+from mambaloc.files import whole_file, writing
 from mambaloc.models.registry import model_class
 from mambaloc.models.transposenet import LitTransPoseNet
 
@@ -132,8 +132,8 @@ def print_report(report: SpeedReport, machine: str) -> None:
 def write_report(report: SpeedReport, path: Path, machine: str) -> None:
     """Write every figure, and where it comes from, as JSON."""
     told = {"machine": machine, "versions": provenance.versions(), **asdict(report)}
-    with writing(path):
-        path.write_text(json.dumps(told, indent=1, default=str), encoding="utf-8")
+    with writing(path), whole_file(path) as partial:
+        partial.write_text(json.dumps(told, indent=1, default=str), encoding="utf-8")
 
 
 def print_speed(speed: Speed, loading: LoadingRates, console: Console) -> None:

@@ -17,7 +17,7 @@ from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import BLOCK, LEVEL, block_resamples, median_interval
 from mambaloc.evaluation.references import frozen_features, median_training_pose, nearest_training_pose, retrieval
 from mambaloc.evaluation.trajectories import write_csv
-from mambaloc.files import sha256, writing
+from mambaloc.files import sha256, whole_file, writing
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models import LitPoseRegressor, load_checkpoint
 from mambaloc.models.base import mib, parameter_count, read_checkpoint
@@ -193,7 +193,8 @@ def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, data: PoseD
     frames = data.frames("test")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        (out / "metrics.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        with whole_file(out / "metrics.json") as partial:
+            partial.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
         write_csv(out / "predictions.csv", table, frames)
         write_tum(out / "predictions.tum", table.index.tolist(), table.predicted_position_m, table.predicted_quaternion)
         write_tum(out / "ground_truth.tum", table.index.tolist(), table.true_position_m, table.true_quaternion)

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from mambaloc.files import whole_file
+
 
 def write_tum(path: Path, time_s: Iterable[float], position_m: Any, quaternion: Any) -> None:
     """Write lines ``timestamp tx ty tz qx qy qz qw``, of arrays or tensors (N, 3) and (N, 4) wxyz, all or none of them.
@@ -14,6 +16,5 @@ def write_tum(path: Path, time_s: Iterable[float], position_m: Any, quaternion: 
     """
     rows = zip(time_s, position_m.tolist(), quaternion.tolist(), strict=True)
     lines = [" ".join(f"{n:.9g}" for n in (t, *xyz, qx, qy, qz, qw)) for t, xyz, (qw, qx, qy, qz) in rows]
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n", encoding="utf-8")
-    partial.replace(path)
+    with whole_file(path) as partial:
+        partial.write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n", encoding="utf-8")

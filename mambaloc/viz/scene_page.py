@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.files import whole_file
 from mambaloc.geometry import matrix_from_quaternion
 from mambaloc.metrics import PoseErrorTable
 from mambaloc.viz.trajectory import TRUE_COLOR, box_around, means, medians
@@ -62,9 +63,8 @@ def write_scene_page(
     summary = f"{medians(table)}; {means(table)}; {len(index)} frames"
     heading, *details = title.split("\n")
     page = _PAGE.substitute(title=html.escape(heading), summary=html.escape("; ".join((*details, summary))), plot=plot)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(page, encoding="utf-8")
-    partial.replace(path)
+    with whole_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
 
 
 def _true_path(table: PoseErrorTable, sequences: Sequence[str], names: Sequence[str]) -> Any:

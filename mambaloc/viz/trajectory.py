@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from mambaloc.files import whole_file
 from mambaloc.metrics import PoseErrorTable, summarise
 
 TRUE_COLOR, PREDICTED_COLOR = "#1a9850", "#d73027"
@@ -80,6 +81,5 @@ def means(table: PoseErrorTable) -> str:
 
 def write_png(figure: Figure, path: Path) -> None:
     """Write a figure, cut to what is on it, beside its place, and move it there whole."""
-    partial = path.with_name(f".{path.name}.partial")
-    FigureCanvasAgg(figure).print_figure(partial, format="png", dpi=140, bbox_inches="tight", pad_inches=0.1)
-    partial.replace(path)
+    with whole_file(path) as partial:
+        FigureCanvasAgg(figure).print_figure(partial, format="png", dpi=140, bbox_inches="tight", pad_inches=0.1)
