@@ -20,7 +20,7 @@ import yaml
 from subjects import SUBJECTS, Subject
 
 from mambaloc.cli import main
-from mambaloc.console import exits_cleanly
+from mambaloc.console import exits_cleanly, quieten
 
 pytestmark = pytest.mark.slow
 
@@ -65,6 +65,7 @@ def audited(below: Path, deed) -> None:
 
 def run(subject: Subject, inputs: Path, out: Path, attack, said) -> None:
     """In a process of its own: attack it, and send what it said and the steps that it took."""
+    quieten()
     steps: list[int] = []
     audited(out, steps.append)
     attack(out)
