@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mambaloc.errors import InputError
+from mambaloc.importing import nerfstudio
 from mambaloc.importing.capture import Capture
 
 
@@ -25,7 +26,9 @@ class Format:
     read: Callable[[Path], Capture]
 
 
-FORMATS: dict[str, Format] = {}
+FORMATS: dict[str, Format] = {
+    "nerfstudio": Format("transforms.json of nerfstudio or instant-ngp", nerfstudio.matches, nerfstudio.read),
+}
 """By name, the most telling first: the first that matches a source is taken."""
 
 
