@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.motion import Motion, apart, quaternions
-from mambaloc.importing.splits import REACH_DEG, Kind, Proposal, best_of, distances, measured
+from mambaloc.importing.splits import MOST_NEAR, NEAR_STEPS, REACH_DEG, Kind, Proposal, best_of, distances, measured
 
 TEST_SHARE, VAL_SHARE = 0.2, 0.1
 
 _LEAST_BLOCK = 3
 _MOST_BLOCKS = 5
-_GAP_SHARE, _LEAST_GAP = 0.02, 2
-_GAP_FACTORS = (1, 1.5, 2, 3, 4)  # tried until a split by blocks is honest
-_MOST_UNUSED = 0.35
+_GAP_SHARE, _LEAST_GAP = 0.02, 1
+_AT_ONCE = 500  # frames whose distances to all others are held
 _MANY_SEQUENCES = 5  # of which every fifth makes a test split, too
 _PASS_SHARE = 0.1  # of a sequence: frames nearer in time are of the same pass
 _LOOP_REACH = 0.1  # of the extent
@@ -47,6 +46,7 @@ def propose(capture: Capture, motion: Motion) -> list[Proposal]:
 class _Advisor:
     def __init__(self, capture: Capture, motion: Motion) -> None:
         self.capture, self.motion = capture, motion
+        self.position, self.quaternion = capture.world_from_cam[:, :3, 3], quaternions(capture)
         # Frames in no order of time are laid along the scene's longest axis, as if they were one recording.
         names = np.array(capture.sequences) if motion.in_order else np.full(len(capture.images), "all")
         self.sequences = [self._laid_out(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
@@ -90,7 +90,7 @@ class _Advisor:
         """The block of a sequence that is best seen from another pass, a fifth of it or less; None where none is."""
         every = -(-len(rows) // _LOOP_FRAMES)
         thin = rows[::every]
-        length, turn_deg = apart(self.capture.world_from_cam[:, :3, 3], quaternions(self.capture), thin, thin)
+        length, turn_deg = apart(self.position, self.quaternion, thin, thin)
         is_seen = (length <= _LOOP_REACH * self.motion.extent) & (turn_deg <= REACH_DEG)
         steps = np.maximum(length / self.motion.step, turn_deg / self.motion.step_deg)
         time = np.arange(len(thin))
@@ -101,30 +101,41 @@ class _Advisor:
             for start in range(0, len(thin) - size + 1, max(1, size // 8)):
                 block, others = slice(start, start + size), (time < start - window) | (time >= start + size + window)
                 if others.any() and is_seen[block][:, others].any(axis=1).mean() >= _COVERED:
-                    found.append((float(np.quantile(steps[block][:, others].min(axis=1), 0.9)), start))
+                    nearest = steps[block][:, others].min(axis=1)
+                    leaks = bool((nearest <= NEAR_STEPS).mean() > MOST_NEAR)
+                    found.append((leaks, float(np.quantile(nearest, 0.9)), start))
             if found:
-                start = min(found)[1]
+                start = min(found)[2]
                 return rows[start * every : (start + size) * every]
         return None
 
     def by_blocks(self) -> Proposal | None:
-        """Evenly spread blocks of a fifth of all frames: as few as make a good split, with as small gaps as do."""
+        """Evenly spread blocks of a fifth of all frames, as few as make a good split; what is near them is left out."""
         total = len(self.capture.images)
         found: list[Proposal] = []
         for count in range(1, _MOST_BLOCKS + 1):
-            size = round(TEST_SHARE * total / count)
-            if found and (found[-1].is_good or size < _LEAST_BLOCK):
+            size = max(1, round(TEST_SHARE * total / count))
+            if found and size < _LEAST_BLOCK:
                 break
-            for factor in _GAP_FACTORS:
-                gap = round(factor * self.gap)
-                split = self._in_blocks(self._spread(count, max(size, 1)), gap)
-                if found and (not _is_whole(split) or (split == "unused").mean() > _MOST_UNUSED):
-                    break
-                blocks = f"{count} block{'s' if count > 1 else ''} of {size} frames"
-                found.append(self.with_validation(self._measured("block", f"{blocks}, gaps of {gap}", split)))
-                if found[-1].is_honest:
-                    break
-        return next((each for each in found if each.is_good), None) or best_of(found)
+            split = self._without_near(self._in_blocks(self._spread(count, size), self.gap))
+            blocks = f"{count} block{'s' if count > 1 else ''} of {size} frames"
+            how = f"{blocks}, gaps of {self.gap} frames and {NEAR_STEPS:g} steps"
+            found.append(self.with_validation(self._measured("block", how, split)))
+            if found[-1].is_good:
+                return found[-1]
+        return best_of(found)
+
+    def _without_near(self, split: NDArray[np.str_]) -> NDArray[np.str_]:
+        """The split without the training frames that are near a test frame of their sequence, if others are left."""
+        sparse = split.copy()
+        for rows in self.sequences:
+            test, near = rows[split[rows] == "test"], np.zeros(len(rows), dtype=bool)
+            for start in range(0, len(test), _AT_ONCE):
+                length, turn_deg = apart(self.position, self.quaternion, test[start : start + _AT_ONCE], rows)
+                steps = np.maximum(length / self.motion.step, turn_deg / self.motion.step_deg)
+                near |= (steps <= NEAR_STEPS).any(axis=0)
+            sparse[rows[near & (split[rows] == "train")]] = "unused"
+        return sparse if _is_whole(sparse) else split
 
     def with_validation(self, proposal: Proposal) -> Proposal:
         """Mark training frames for validation: a block, after a gap, or a recording.
@@ -168,7 +179,7 @@ class _Advisor:
     def _laid_out(self, rows: Rows) -> Rows:
         if self.motion.in_order:
             return rows
-        position = self.capture.world_from_cam[rows, :3, 3]
+        position = self.position[rows]
         longest = np.linalg.svd(position - position.mean(axis=0), full_matrices=False)[2][0]
         return rows[np.argsort(position @ longest, kind="stable")]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -15,7 +15,7 @@ from mambaloc.files import whole_folder
 from mambaloc.importing import sanity
 from mambaloc.importing.advisor import propose
 from mambaloc.importing.canonical import Imported, write_frames, write_scene
-from mambaloc.importing.capture import Capture
+from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.conventions import check_agreement, check_axes, check_up, up_of
 from mambaloc.importing.epipolar import agreement
 from mambaloc.importing.findings import Finding, verdict_of
@@ -66,10 +66,8 @@ def import_scene(
     capture = selected(capture, [row for row in range(len(capture.images)) if row not in broken])
     capture = _near_the_origin(_in_metres(capture, metres_per_unit))
     with whole_folder(out, "choose another folder with --out") as partial:
-        lenses = capture.cameras
-        capture, sizes, rules = write_pictures(capture, partial)
-        imported = _checked(capture, sizes, {**left_out, **rules}, split)
-        imported = replace(imported, lenses=lenses)
+        written, sizes, rules = write_pictures(capture, partial)
+        imported = _checked(written, capture.cameras, sizes, {**left_out, **rules}, split)
         write_frames(imported, partial)
         write_report(imported, partial, out.name)
         write_scene(imported, partial, source, command)
@@ -93,14 +91,16 @@ def _near_the_origin(capture: Capture) -> Capture:
     middle = np.median(position, axis=0).round() if len(position) else np.zeros(3)
     extent = float(np.linalg.norm(np.ptp(position, axis=0))) if len(position) else 0.0
     if np.linalg.norm(middle) <= _FAR * max(extent, 1e-3):
-        return replace(capture, choices={**capture.choices, "origin": "as in the source"})
+        return replace(capture, choices={"origin": "as in the source", **capture.choices})
     world_from_cam = capture.world_from_cam.copy()
     world_from_cam[:, :3, 3] -= middle
     told = f"shifted to {middle.tolist()} of the source's world, so that float32 holds the positions"
     return replace(capture, world_from_cam=world_from_cam, choices={**capture.choices, "origin": told})
 
 
-def _checked(capture: Capture, sizes: Sequence[Size], left_out: dict[str, str], asked: str) -> Imported:
+def _checked(
+    capture: Capture, lenses: Mapping[str, Camera], sizes: Sequence[Size], left_out: Mapping[str, str], asked: str
+) -> Imported:
     """Check what was written, and split what can be used of it."""
     usable = _of_the_usual_shape(sizes)
     odd = len(sizes) - len(usable)
@@ -117,7 +117,14 @@ def _checked(capture: Capture, sizes: Sequence[Size], left_out: dict[str, str], 
             split[usable] = chosen.proposal.split
             findings.append(Finding("split", f"by {chosen.proposal.kind}: {chosen.proposal.how}", chosen.warning))
     return Imported(
-        capture, {}, tuple(split.tolist()), tuple(findings), verdict_of(findings), tuple(proposals), chosen, left_out
+        capture=capture,
+        lenses=lenses,
+        split=tuple(split.tolist()),
+        findings=tuple(findings),
+        verdict=verdict_of(findings),
+        proposals=tuple(proposals),
+        chosen=chosen,
+        left_out=left_out,
     )
 
 

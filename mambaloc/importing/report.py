@@ -59,40 +59,48 @@ def print_summary(imported: Imported, folder: Path) -> None:
     console.print(table, markup=False)
     if imported.chosen is None:
         return
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title=_TABLE_TITLE, title_justify="left")
-    for column in _columns(imported.unit):
-        table.add_column(column, justify="left" if column in ("split by", "") else "right")
-    for proposal in imported.proposals:
-        is_taken = proposal is imported.chosen.proposal
-        table.add_row(*_cells(proposal), style="bold" if is_taken else "")
-    console.print(table)
+    console.print(_proposals(imported))
     console.print(f"chosen: {imported.chosen.proposal.kind}, {imported.chosen.why}", soft_wrap=True)
     training = f"python tools/train.py recipes/my_scene.yaml --data.scene {folder}"
     console.print(f"wrote {folder}: {REPORT_FILE}, {PLOT_FILE}; next: {training}", soft_wrap=True, markup=False)
 
 
-_TABLE_TITLE = "from test frames to the nearest training frame: median (10 % to 90 %)"
+_TABLE_TITLE = "from test frames to the nearest training frame"
 
 
-def _columns(unit: str) -> tuple[str, ...]:
-    return ("split by", "train/val/test", unit, "deg", "steps", "near", "")
+def _proposals(imported: Imported) -> Table:
+    """Three lines a proposal: distances in the capture's unit, in degrees, in steps."""
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title=_TABLE_TITLE, title_justify="left")
+    for column in ("split by", "train/val/test", "near", "", "", "10 %", "median", "90 %"):
+        table.add_column(column, justify="right" if column[-1:] in ("%", "n") or column == "near" else "left")
+    for proposal in imported.proposals:
+        style = "bold" if imported.chosen and proposal is imported.chosen.proposal else ""
+        names: tuple[str, ...] = (proposal.kind, _counts(proposal), f"{proposal.near:.0%}", _quality(proposal))
+        for unit, told in _told(proposal, imported.unit).items():
+            table.add_row(*names, unit, *map(_short, told), style=style)
+            names = ("", "", "", "")
+    return table
 
 
-def _cells(proposal: Proposal) -> tuple[str, ...]:
-    counts = proposal.counts
+def _told(proposal: Proposal, unit: str) -> dict[str, tuple[float, float, float]]:
+    return {unit: proposal.length, "deg": proposal.turn_deg, "steps": proposal.steps}
+
+
+def _counts(proposal: Proposal) -> str:
+    return "/".join(str(proposal.counts[split]) for split in ("train", "val", "test"))
+
+
+def _quality(proposal: Proposal) -> str:
     faults = [word for word, holds in (("leaks", not proposal.is_honest), ("far", not proposal.is_learnable)) if holds]
-    return (
-        proposal.kind,
-        "/".join(str(counts[split]) for split in ("train", "val", "test")),
-        *map(_quantiles, (proposal.length, proposal.turn_deg, proposal.steps)),
-        f"{proposal.near:.0%}",
-        ", ".join(faults) or "good",
-    )
+    return ", ".join(faults) or "good"
 
 
-def _quantiles(told: tuple[float, float, float]) -> str:
-    low, middle, high = (f"{each:.0f}" if each >= 99.5 else f"{each:.2g}" for each in told)
-    return f"{middle} ({low} to {high})"
+def _spans(proposal: Proposal) -> list[str]:
+    return [f"{_short(b)} ({_short(a)} to {_short(c)})" for a, b, c in _told(proposal, "").values()]
+
+
+def _short(number: float) -> str:
+    return f"{number:.0f}" if number >= 99.5 else f"{number:.2g}"
 
 
 def _page(imported: Imported, name: str) -> str:
@@ -106,9 +114,12 @@ def _page(imported: Imported, name: str) -> str:
         chosen = imported.chosen
         parts.append(f"By **{chosen.proposal.kind}**: {chosen.proposal.how}; {chosen.why}.")
         parts += [f"**Warning:** {chosen.warning}."] if chosen.warning else []
-        parts.append(f"{_TABLE_TITLE[0].upper()}{_TABLE_TITLE[1:]}:")
-        rows = [_cells(proposal) for proposal in imported.proposals]
-        parts.append(_table(_columns(imported.unit), rows))
+        parts.append(f"{_TABLE_TITLE[0].upper()}{_TABLE_TITLE[1:]}: median (10 % to 90 %).")
+        header = ("split by", "train/val/test", "near", "", *_told(chosen.proposal, imported.unit))
+        rows = [
+            (each.kind, _counts(each), f"{each.near:.0%}", _quality(each), *_spans(each)) for each in imported.proposals
+        ]
+        parts.append(_table(header, rows))
         parts += [f"- {proposal.kind}: {proposal.how}" for proposal in imported.proposals]
         parts.append(RULE)
     parts.append("## Decided")

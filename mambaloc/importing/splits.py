@@ -31,7 +31,7 @@ RULE = (
     f"A proposal is honest where at most {MOST_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
     f"training frame, and learnable where the median test frame's nearest one is within {REACH:.0%} of the scene's "
     f"extent and {REACH_DEG:g}°. The first that is both is taken, in the order {', '.join(KINDS)}; failing that, the "
-    "one with the fewest near frames of those that are learnable, or of all."
+    "one with the fewest near frames of those that are learnable, or of all, and then the nearest."
 )
 
 _MEASURED = 400  # test frames at most, evenly spread
@@ -138,8 +138,8 @@ _LACKS = {
 
 
 def best_of(proposals: Sequence[Proposal]) -> Proposal:
-    """The one with the fewest near test frames of those that are learnable, or of all."""
-    return min(proposals, key=lambda each: (not each.is_learnable, each.near))
+    """The one with the fewest near frames of those that are learnable, or of all; among honest ones, the nearest."""
+    return min(proposals, key=lambda each: (not each.is_learnable, max(each.near, MOST_NEAR), each.steps[1]))
 
 
 def measured(kind: Kind, how: str, split: NDArray[np.str_], capture: Capture, motion: Motion) -> Proposal:

@@ -77,17 +77,21 @@ def _plot_axes(position: Floats, up: Floats) -> tuple[list[Floats], list[str]]:
     """Directions to plot along, right-handed: two that are level, and up; and what they are called."""
     vertical = int(np.abs(up).argmax())
     if np.abs(up[vertical]) > 1 - 1e-9:
-        first, second = ((vertical + 1) % 3, (vertical + 2) % 3)
-        if up[vertical] < 0:
-            first, second = second, first
-        sign = "-" if up[vertical] < 0 else ""
-        return [np.eye(3)[first], np.eye(3)[second], up], ["xyz"[first], "xyz"[second], f"{sign}{'xyz'[vertical]}"]
+        first, second = np.eye(3)[(vertical + 1) % 3], np.eye(3)[(vertical + 2) % 3] * np.sign(up[vertical])
+        if np.ptp(position @ second) > np.ptp(position @ first):
+            first, second = second, -first
+        return [first, second, up], [_axis_name(each) for each in (first, second, up)]
     level = position - position.mean(axis=0)
     level = level - np.outer(level @ up, up)
     along = np.linalg.svd(level, full_matrices=False)[2][0]
     along = along - (along @ up) * up
     along = along / np.linalg.norm(along)
     return [along, np.cross(up, along), up], ["along", "across", "up"]
+
+
+def _axis_name(axis: Floats) -> str:
+    place = int(np.abs(axis).argmax())
+    return f"{'-' if axis[place] < 0 else ''}{'xyz'[place]}"
 
 
 def _draw(

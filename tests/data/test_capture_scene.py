@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from mambaloc.data import PoseDataModule
 from mambaloc.data.capture_scene import COLUMNS, focal_ratio_of, is_captured, read_rows, read_split
 from mambaloc.data.datasets import locate, scene_folder
+from mambaloc.data.download.origins import licence_of_weights
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
 from mambaloc.export import contract_of
@@ -216,6 +217,7 @@ def test_a_path_is_read_whatever_the_recipes_dataset_is(scene, tmp_path, dataset
     assert said["listed_frames"] == {"train": 6, "val": 2, "test": 3}
     contract = contract_of(LitStudent(backbone="resnet10t", width=8, image_size=16), data.hparams)
     assert contract.scene == "capture/den"
+    assert "who took them" in licence_of_weights(data.hparams["dataset"])
     again = PoseDataModule(**{name: value for name, value in data.hparams.items() if not name.startswith("_")})
     assert again.folder == data.folder == scene
 

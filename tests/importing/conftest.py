@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 from captures import FLIP, FOCAL_PX, LENS, SIZE, Rendered
 
-from mambaloc.data.rendering import embedded_room, embedded_walk, render
+from mambaloc.data.rendering import Room, embedded_room, embedded_walk, render
 
 
 @pytest.fixture(scope="session")
-def rendered_once(tmp_path_factory) -> Rendered:
+def room() -> Room:
+    """The embedded room."""
+    return embedded_room()
+
+
+@pytest.fixture(scope="session")
+def rendered_once(room, tmp_path_factory) -> Rendered:
     """Forty frames of a walk, distorted by OpenCV's own inverse of the lens."""
     folder = tmp_path_factory.mktemp("captures") / "room"
     (folder / "images").mkdir(parents=True)
@@ -26,7 +32,7 @@ def rendered_once(tmp_path_factory) -> Rendered:
     rays = cv2.undistortPoints(pixels, matrix, coefficients).reshape(SIZE[1], SIZE[0], 2)
     wide = np.array([[1.5 * FOCAL_PX, 0, SIZE[0]], [0, 1.5 * FOCAL_PX, SIZE[1]], [0, 0, 1]])
     where = (rays * 1.5 * FOCAL_PX + SIZE).astype(np.float32)
-    room, frames = embedded_room(), []
+    frames = []
     for number, world_from_cam in enumerate(walk):
         rgb, _ = render(room, wide, world_from_cam, (2 * SIZE[0], 2 * SIZE[1]))
         seen = cv2.remap(rgb, where[..., 0], where[..., 1], cv2.INTER_LINEAR)

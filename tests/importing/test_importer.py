@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.data.capture_scene import COLUMNS, read_rows, read_split
 from mambaloc.data.frames import BadFrames
-from mambaloc.data.rendering import embedded_room, render
+from mambaloc.data.rendering import render
 from mambaloc.errors import InputError
 from mambaloc.images import read_image
 from mambaloc.importing.canonical import Imported
@@ -69,7 +69,7 @@ def test_poses_come_back_as_they_were(scene, rendered_once):
     assert (poses[:, 3] >= 0).all()
 
 
-def test_undistorted_images_are_those_of_the_pinhole_that_is_told(scene, rendered_once):
+def test_undistorted_images_are_those_of_the_pinhole_that_is_told(scene, rendered_once, room):
     (camera,) = told(scene)["cameras"].values()
     assert (camera["width"], camera["height"]) == SIZE
     assert camera["lens"]["model"] == "OPENCV"
@@ -84,7 +84,7 @@ def test_undistorted_images_are_those_of_the_pinhole_that_is_told(scene, rendere
     assert not np.isclose(camera["focal_px"][0], FOCAL_PX, rtol=1e-3)
     for row in (0, 13, 39):
         seen = read_image(scene / f"images/images/{row + 1:04d}.png").astype(float)
-        expected, _ = render(embedded_room(), matrix, rendered_once.world_from_cam[row], SIZE)
+        expected, _ = render(room, matrix, rendered_once.world_from_cam[row], SIZE)
         distorted = read_image(rendered_once.folder / f"images/{row + 1:04d}.png")
         by_opencv = cv2.undistort(distorted, rendered_once.matrix, rendered_once.coefficients, None, matrix)
         inside = (slice(2, -2), slice(2, -2))
@@ -147,7 +147,7 @@ def test_a_world_far_away_is_shifted(rendered, tmp_path):
     np.testing.assert_allclose(
         np.diff(poses[:, :3], axis=0), np.diff(rendered.world_from_cam[:, :3, 3], axis=0), atol=1e-8
     )
-    assert "shifted to [450000.0, 5200000.0" in told(tmp_path / "a")["choices"]["origin"]
+    assert "shifted to [449999.0, 5200000.0" in told(tmp_path / "a")["choices"]["origin"]
 
 
 # --- what captures really look like ----------------------------------------------------------------------------------
@@ -220,7 +220,8 @@ EXIF_TURNED = (
 def test_a_photograph_with_exif_is_turned_as_its_camera_has_it(rendered_once, tmp_path, size):
     """Structure from motion may have seen it either way; the camera's size says which."""
     capture = selected(read_capture(rendered_once.folder), [0])
-    stored = read_image(capture.images[0])
+    coarse = np.random.default_rng(1).integers(0, 256, (3, 4, 3), dtype=np.uint8)
+    stored = cv2.resize(coarse, SIZE, interpolation=cv2.INTER_CUBIC)
     jpeg = cv2.imencode(".jpg", stored[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
     segment = b"\xff\xe1" + (len(EXIF_TURNED) + 2).to_bytes(2, "big") + EXIF_TURNED
     (tmp_path / "a.jpg").write_bytes(jpeg[:2] + segment + jpeg[2:])
@@ -284,7 +285,7 @@ def test_the_tool_says_what_it_found(rendered_once, tmp_path, capsys):
         (["{room}", "--out", "{tmp}/a", "--split", "given"], "--split given: this capture has no split of its own"),
         (["{room}", "--out", "{tmp}/a", "--split", "sequence"], "this capture has one sequence; choose one of auto"),
         (["{room}/images", "--out", "{tmp}/a"], "looks like no format that is known"),
-        (["{room}", "--out", "{tmp}/file/a"], "cannot be"),
+        (["{room}", "--out", "{tmp}/file/a"], "choose another folder with --out"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(words, message, rendered_once, tmp_path, capsys):
@@ -293,7 +294,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(words, message, rendered_once, tm
         tool(*(word.format(tmp=tmp_path, room=rendered_once.folder) for word in words))
     assert exit_.value.code == 2
     error = capsys.readouterr().err.strip()
-    assert message in error or "Not a directory" in error
+    assert message in error
     assert len(error.splitlines()) == 1
     assert not (tmp_path / "a").exists()
     assert not list(tmp_path.glob(".*"))

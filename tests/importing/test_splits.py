@@ -54,7 +54,7 @@ def test_one_straight_recording_is_split_by_blocks():
     assert block.is_learnable
     test, train = (np.flatnonzero(block.split == split) for split in ("test", "train"))
     gaps = np.abs(test[:, None] - train).min(axis=1)
-    assert gaps.min() == 5  # four frames are left out on either side
+    assert gaps.min() == 5  # two in a hundred frames are left out on either side
     assert block.steps[1] == pytest.approx(np.median(gaps))
     assert choose(list(found.values()), "auto").proposal is block
 
@@ -155,10 +155,10 @@ def test_frames_in_no_order_are_split_by_place():
 def test_every_count_of_frames_can_be_split(count):
     counts = proposals_of(capture_of(laps(count, 1)))["block"].counts
     assert sum(counts.values()) == count
-    assert counts["train"] >= 0.3 * count
+    assert counts["train"] >= 0.25 * count
     assert min(counts["val"], counts["test"]) >= 2
 
 
 def test_the_rule_says_its_numbers():
-    assert "10% of its test frames are within 2 steps" in RULE
+    assert "at most 10% of its test frames are near, within 2 steps" in RULE
     assert "given, sequence, loop, block" in RULE
