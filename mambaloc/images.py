@@ -22,17 +22,22 @@ END_BYTES = 4096
 _MARKERS = {b"\x89PNG": b"IEND", b"\xff\xd8\xff": b"\xff\xd9"}  # how a format starts, and how a whole file ends
 
 
-def decode_image(data: bytes) -> Image | str:
-    """Decode a file's bytes to RGB, upright by its EXIF orientation; or return the rule that it breaks.
+def decode_image(data: bytes, upright: bool = True) -> Image | str:
+    """Decode a file's bytes to RGB; or return the rule that it breaks.
 
     Grey becomes RGB, and an alpha channel is dropped.
+
+    Args:
+        data: of the file.
+        upright: turn it as its EXIF orientation says; otherwise pixels are those that the file holds.
     """
+    flags = cv2.IMREAD_COLOR if upright else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     for start, end in _MARKERS.items():
         # OpenCV fills what a truncated file lacks with grey and says nothing.
         if data.startswith(start) and end not in data[-END_BYTES:]:
             return "image is truncated"
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error:  # a damaged header that asks for more than 2^30 pixels
         image = None
     if image is None:

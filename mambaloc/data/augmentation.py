@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mambaloc.geometry import canonical, multiply, turn_towards
+
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as torchvision and PIL
 
 
@@ -104,3 +106,23 @@ def center_crop(image: Tensor, crop: tuple[int, int]) -> Tensor:
 def center_corner(image: Tensor, crop: tuple[int, int]) -> tuple[int, int]:
     """Row and column of the top-left pixel of a batch's centre crop; (B, 3, H, W) -> two numbers."""
     return (image.shape[-2] - crop[0]) // 2, (image.shape[-1] - crop[1]) // 2
+
+
+def turned(
+    quaternion: Tensor, image: Tensor, how: Augmentations, crop: tuple[int, int], focal_ratio: float | None
+) -> Tensor:
+    """Rotations of cameras that look at the middle of their crop, as an image's does at its centre crop's.
+
+    Args:
+        quaternion: true rotations, ``world_from_cam``, (B, 4).
+        image: the batch before it is cropped, (B, 3, H, W).
+        how: which crops are taken.
+        crop: height and width in pixels.
+        focal_ratio: focal length over the images' width; None leaves the rotations as they are.
+    """
+    if focal_ratio is None:
+        return quaternion
+    focal_px = focal_ratio * image.shape[-1]
+    top, left = center_corner(image, crop)
+    turn = turn_towards((how.left - left) / focal_px, (how.top - top) / focal_px)
+    return canonical(multiply(quaternion, turn))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,43 +16,35 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from mambaloc import provenance
 from mambaloc.data.augmentation import (
-    Augmentations,
     Jitter,
     augment,
     augmentations,
     center_corner,
     center_crop,
     draw_uniforms,
+    turned,
 )
-from mambaloc.data.cache import cached_frames
 from mambaloc.data.cached_dataset import CachedFrames
-from mambaloc.data.datasets import DATASETS, is_official, is_rendered, scene_folder
+from mambaloc.data.capture_scene import describe_capture, focal_ratio_of
+from mambaloc.data.datasets import CAPTURE, DATASETS, is_official, is_rendered, locate, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
+from mambaloc.data.loaded_split import LoadedSplit, describe_points, load_split
 from mambaloc.data.points import read_points
 from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
 from mambaloc.errors import InputError
-from mambaloc.geometry import canonical, cropped_intrinsics, multiply, turn_towards
+from mambaloc.geometry import cropped_intrinsics
 from mambaloc.types import PoseBatch, height_and_width
 
 Part = Literal["train", "val", "test"]
-
-
-@dataclass(frozen=True)
-class LoadedSplit:
-    """One part of a scene, what was left out of it, and a hash of its images and poses."""
-
-    data: CachedFrames
-    bad: BadFrames
-    fingerprint: str
 
 
 class PoseDataModule(L.LightningDataModule):
     """A scene's training, validation and test frames.
 
     Args:
-        dataset: ``7scenes``, ``cambridge``, or ``embedded``: the generated room.
+        dataset: ``7scenes``, ``cambridge``, ``embedded``: the generated room, or ``capture``: an imported scene.
         root: folder that holds the scenes; the dataset's own default unless given.
-        scene: folder of the scene under ``root``.
+        scene: folder of the scene under ``root``; or an imported scene's path, whatever the other two say.
         image_size: side of the square crop, or (height, width), in pixels.
         short_side: what the shorter side of every image is resized to, in pixels.
         batch_size: training images, or clips, a step, per device.
@@ -64,10 +56,12 @@ class PoseDataModule(L.LightningDataModule):
         brightness: range of that jitter factor, ``[1 - x, 1 + x]``.
         contrast: likewise.
         saturation: likewise.
-        focal_ratio: focal length of the scene's cameras over their images' width, 0.914 for 7-Scenes. If given, the
-            true rotation turns with each random crop, as a camera that looks at the crop's middle would; otherwise, as
-            the paper has it, the same pose is asked of every crop, which are degrees apart.
-        validation: how the best epoch is chosen; ``test_set`` selects on the test set and is reported as such.
+        focal_ratio: focal length of the scene's cameras over their images' width, 0.914 for 7-Scenes; ``scene`` takes
+            an imported scene's own, where that is known and one for all. If given, the true rotation turns with each
+            random crop, as a camera that looks at the crop's middle would; otherwise, as the paper has it, the same
+            pose is asked of every crop, which are degrees apart.
+        validation: how the best epoch is chosen, see :data:`~mambaloc.data.splits.Validation`; ``test_set`` selects on
+            the test set and is reported as such.
         val_fraction: share of the training frames that is held out.
         val_gap: frames dropped between a held-out block and training frames.
         val_sequences: sequences to hold out, by name; with ``validation: block``, those whose ends to hold out.
@@ -95,7 +89,7 @@ class PoseDataModule(L.LightningDataModule):
         brightness: float = 0.3,
         contrast: float = 0.3,
         saturation: float = 0.3,
-        focal_ratio: float | None = None,
+        focal_ratio: float | Literal["scene"] | None = None,
         validation: Validation = "auto",
         val_fraction: float = 0.1,
         val_gap: int = 20,
@@ -110,15 +104,19 @@ class PoseDataModule(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
+        # LightningCLI has given what the recipe says; what is kept, and told, is what that means.
+        dataset, root, scene = locate(dataset, root, scene)
+        self.hparams.update(dataset=dataset, root=root, scene=scene)
         self.crop = height_and_width(image_size)
         if max(self.crop) > short_side and min(self.crop) > short_side:
             raise InputError(f"data.image_size {image_size}: larger than data.short_side {short_side}; enlarge that")
         if points_per_frame < 0:
             raise InputError(f"data.points_per_frame {points_per_frame}: must be 0 or more; 0 reads none")
-        if focal_ratio is not None and (focal_ratio <= 0 or points_per_frame > 0):
+        is_bad = focal_ratio not in (None, "scene") and not (isinstance(focal_ratio, int | float) and focal_ratio > 0)
+        if is_bad or (focal_ratio is not None and points_per_frame > 0):
             raise InputError(
-                f"data.focal_ratio {focal_ratio}: must be more than 0, and is not for scene points, whose intrinsics "
-                "follow the crop; leave it out"
+                f"data.focal_ratio {focal_ratio}: must be more than 0, or 'scene', and is not for scene points, whose "
+                "intrinsics follow the crop; leave it out"
             )
         self.jitter = Jitter(brightness, contrast, saturation)
         self._loaded: dict[Part, LoadedSplit] = {}
@@ -189,7 +187,8 @@ class PoseDataModule(L.LightningDataModule):
             "clip_skip": hparams["clip_skip"],
             "image_size": list(self.crop),
             "short_side": hparams["short_side"],
-            **self._describe_points(),
+            **describe_points(self._loaded),
+            **(describe_capture(self.folder) if hparams["dataset"] == CAPTURE else {}),
         }
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
@@ -223,18 +222,17 @@ class PoseDataModule(L.LightningDataModule):
             uniform = self._epoch_uniforms(self.trainer.current_epoch, batch.index.device)[batch.index]
             how = augmentations(batch.image, self.crop, self.jitter, uniform)
             corner = (how.top, how.left)
-            image, quaternion = augment(batch.image, how, self.crop), self._turned(batch, how)
+            image = augment(batch.image, how, self.crop)
+            quaternion = turned(batch.quaternion, batch.image, how, self.crop, self._focal_ratio)
         intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, *corner)
         return replace(batch, image=image, quaternion=quaternion, intrinsics=intrinsics)
 
-    def _turned(self, batch: PoseBatch, how: Augmentations) -> Tensor:
-        """Rotations of cameras that look at the middle of their crop, as an image's does at its centre crop's."""
-        if self.hparams["focal_ratio"] is None:
-            return batch.quaternion
-        focal_px = self.hparams["focal_ratio"] * batch.image.shape[-1]
-        top, left = center_corner(batch.image, self.crop)
-        turn = turn_towards((how.left - left) / focal_px, (how.top - top) / focal_px)
-        return canonical(multiply(batch.quaternion, turn))
+    @cached_property
+    def _focal_ratio(self) -> float | None:
+        """What ``focal_ratio`` comes to in this scene."""
+        if self.hparams["focal_ratio"] != "scene":
+            return self.hparams["focal_ratio"]
+        return focal_ratio_of(self.folder) if self.hparams["dataset"] == CAPTURE else None
 
     def _epoch_uniforms(self, epoch: int, device: torch.device) -> Tensor:
         """An epoch's chances of every training frame, drawn and sent to the device once."""
@@ -252,19 +250,7 @@ class PoseDataModule(L.LightningDataModule):
         return frames, bad
 
     def _decode(self, frames: Frames, bad: BadFrames) -> LoadedSplit:
-        cache_dir = self.hparams["cache_dir"]
-        cache = cached_frames(
-            frames.image_paths, self.hparams["short_side"], bad, Path(cache_dir) if cache_dir else None
-        )
-        height, width = cache.images.shape[-2:]
-        if self.crop[0] > height or self.crop[1] > width:
-            raise InputError(
-                f"data.image_size {self.hparams['image_size']}: larger than images resized to {width}x{height}; "
-                "choose a smaller (height, width), or enlarge data.short_side"
-            )
-        frames = frames.select(cache.rows)
-        fingerprint = hashlib.sha256(f"{cache.key} {frames.digest()}".encode()).hexdigest()
-        return LoadedSplit(CachedFrames(frames, cache.images), bad, fingerprint)
+        return load_split(frames, bad, self.hparams["short_side"], self.crop, self.hparams["cache_dir"])
 
     def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
         """Add what each frame may see, of the frames that could be decoded."""
@@ -282,32 +268,33 @@ class PoseDataModule(L.LightningDataModule):
         clips = clips_of(data.frames, length, max(1, round(self.hparams["clip_skip"] / thinned_by)))
         return replace(loaded, data=CachedFrames(data.frames, data.images, data.points, clips))
 
-    def _describe_points(self) -> dict[str, Any]:
-        """Where points come from, and the median of how many a frame has; nothing where none were read."""
-        points = {part: loaded.data.points for part, loaded in self._loaded.items() if loaded.data.points}
-        if not points:
-            return {}
-        return {
-            "points_source": {part: of.source for part, of in points.items()},
-            "points_per_frame": {part: float(np.median(of.per_frame())) for part, of in points.items()},
-        }
-
     def _load_train_and_val(self) -> None:
         train, val, thinned_by, bad = self._chosen()
         if val is not None:
-            self._loaded["val"] = self._with_points(self._decode(val, BadFrames(bad.policy)))
+            self._loaded["val"] = self._with_points(self._decode(*val))
         self._loaded["train"] = self._in_clips(self._with_points(self._decode(train, bad)), thinned_by)
 
-    def _chosen(self) -> tuple[Frames, Frames | None, float, BadFrames]:
-        """Frames to train on, those held out, how many to one were thinned, and what was left out of all of them."""
+    def _chosen(self) -> tuple[Frames, tuple[Frames, BadFrames] | None, float, BadFrames]:
+        """Frames to train on, those to validate on, how many to one were thinned, and what was left out of either."""
         train, bad = self._read("train")
-        val, validation = None, self.hparams["validation"]
-        if validation not in ("none", "test_set"):
+        validation = self.hparams["validation"]
+        val = self._marked() if validation in ("auto", "marked") else None
+        if val is None and validation not in ("none", "test_set"):
             options = {name: self.hparams[f"val_{name}"] for name in ("fraction", "gap", "sequences")}
             train_rows, val_rows = hold_out(train, validation, **options)
-            train, val = train.select(train_rows), train.select(val_rows)
+            train, val = train.select(train_rows), (train.select(val_rows), BadFrames(bad.policy))
         kept = subsample(train, self.hparams["keep_every"], self.hparams["keep_count"])
         return train.select(kept), val, len(train) / len(kept), bad
+
+    def _marked(self) -> tuple[Frames, BadFrames] | None:
+        """Frames that the scene marks for validation, and what was left out of them."""
+        if DATASETS[self.hparams["dataset"]].marks_validation:
+            frames, bad = self._read("val")
+            if len(frames):
+                return frames, bad
+        if self.hparams["validation"] == "marked":
+            raise InputError(f"data.validation marked: {self.folder} marks no frames as val; use auto, or none")
+        return None
 
     def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._data(part), self.trainer

@@ -7,11 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mambaloc.data import cambridge, seven_scenes
+from mambaloc.data import cambridge, capture_scene, seven_scenes
 from mambaloc.data.download.origins import how_to_get
 from mambaloc.data.frames import BadFrames, Frames, Split
 from mambaloc.errors import InputError
 from mambaloc.user_cache import default_cache_dir
+
+CAPTURE = "capture"
+"""Scenes that ``tools/import_scene.py`` made, each named by its folder's path."""
 
 
 @dataclass(frozen=True)
@@ -22,18 +25,38 @@ class Dataset:
         read_split: reads a scene's folder.
         official_counts: train and test frames of each official scene; a scene of other counts is not the benchmark's.
         default_root: where its scenes lie unless a recipe says otherwise.
+        marks_validation: whether its scenes may have a split ``val``, too.
     """
 
     read_split: Callable[[Path, Split, BadFrames], Frames]
     official_counts: dict[str, tuple[int, int]]
     default_root: Path
+    marks_validation: bool = False
 
 
 DATASETS: dict[str, Dataset] = {
     "7scenes": Dataset(seven_scenes.read_split, seven_scenes.OFFICIAL_COUNTS, Path("data/7scenes")),
     "cambridge": Dataset(cambridge.read_split, cambridge.OFFICIAL_COUNTS, Path("data/cambridge")),
     "embedded": Dataset(seven_scenes.read_split, {}, default_cache_dir() / "scenes"),
+    CAPTURE: Dataset(capture_scene.read_split, {}, Path("scenes"), marks_validation=True),
 }
+
+
+def locate(dataset: str, root: str | None, scene: str) -> tuple[str, str | None, str]:
+    """Say what a recipe's ``dataset``, ``root`` and ``scene`` mean, where the scene may be an imported one's path.
+
+    A folder of that name in the root comes first; then, if the name is a path and not a plain name, the folder there.
+
+    Returns:
+        The three, changed where the scene is an imported one.
+    """
+    for folder in (Path(root, scene) if root else None, Path(scene) if Path(scene).name != scene else None):
+        if folder is not None and folder.is_dir():
+            if not capture_scene.is_captured(folder):
+                break
+            folder = folder if folder.name not in ("", "..") else folder.resolve()
+            return CAPTURE, str(folder.parent), folder.name
+    return dataset, root, scene
 
 
 def scene_folder(dataset: str, root: Path | None, scene: str) -> Path:
@@ -50,8 +73,18 @@ def scene_folder(dataset: str, root: Path | None, scene: str) -> Path:
 
         return ensure_embedded_scene(root)
     if not (root / scene).is_dir():
-        raise InputError(how_to_get(dataset, scene, root))
+        raise InputError(_how_to_get(dataset, scene, root))
     return root / scene
+
+
+def _how_to_get(dataset: str, scene: str, root: Path) -> str:
+    path = Path(scene) if Path(scene).name != scene else root / scene if dataset == CAPTURE else None
+    if path is None and capture_scene.is_captured(Path(scene)):
+        return f"{scene} is not in {root}; if you mean the imported scene here, name its path: --data.scene ./{scene}"
+    if path is None:
+        return how_to_get(dataset, scene, root)
+    source, out = (path, Path("scenes", path.name)) if path.is_dir() else ("CAPTURE", path)
+    return f"{path}: is no imported scene; make one with: python tools/import_scene.py {source} --out {out}"
 
 
 def is_rendered(folder: Path) -> bool:
@@ -71,4 +104,4 @@ def is_official(dataset: str, scene: str, listed: dict[str, int]) -> bool:
     return all(official[split == "test"] == count for split, count in listed.items())
 
 
-__all__ = ["DATASETS", "Dataset", "is_official", "is_rendered", "scene_folder"]
+__all__ = ["CAPTURE", "DATASETS", "Dataset", "is_official", "is_rendered", "locate", "scene_folder"]

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 
-Split = Literal["train", "test"]
+Split = Literal["train", "val", "test"]
+"""Imported scenes mark frames for validation; the benchmarks have none."""
 OnBadFrame = Literal["error", "skip"]
 
 

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from mambaloc.data.frames import Frames
 from mambaloc.errors import InputError
 
-Validation = Literal["auto", "sequences", "block", "none", "test_set"]
-"""How the best epoch is chosen. ``auto`` holds out sequences where there are several, else a block;
-``test_set`` selects on the test set, as several published codes do, and is written into every result."""
+Validation = Literal["auto", "marked", "sequences", "block", "none", "test_set"]
+"""How the best epoch is chosen. ``marked`` takes the frames that an imported scene marks for it; ``auto`` does where
+there are any, else holds out sequences where there are several, else a block; ``test_set`` selects on the test set, as
+several published codes do, and is written into every result."""
 
 
 def hold_out(

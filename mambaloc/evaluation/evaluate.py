@@ -116,7 +116,7 @@ def selection_rule(stored: dict[str, Any], checkpoint: Path) -> str:
         return "last"
     if _validates_on_test(stored):
         return f"best on TEST: lowest {monitor} ON THE TEST SET, so its errors are not those of unseen frames"
-    return f"best: lowest {monitor} on frames held out of the training split"
+    return f"best: lowest {monitor} on frames held out of training"
 
 
 def _validates_on_test(stored: dict[str, Any]) -> bool:

@@ -1,5 +1,6 @@
 """Plots."""
 
+from mambaloc.viz.capture import draw_capture
 from mambaloc.viz.features import draw_features, position_features, principal_colors
 from mambaloc.viz.heatmaps import BranchHeat, draw_heat_maps, heat_maps
 from mambaloc.viz.scene_page import write_scene_page
@@ -8,6 +9,7 @@ from mambaloc.viz.trajectory import draw_trajectory
 
 __all__ = [
     "BranchHeat",
+    "draw_capture",
     "draw_features",
     "draw_heat_maps",
     "draw_top_view",

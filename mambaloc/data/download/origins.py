@@ -134,6 +134,8 @@ SOURCES = {source.name: source for source in (SEVENSCENES, CAMBRIDGE)}
 
 def licence_of_weights(dataset: str) -> str:
     """Terms of weights that were trained on a dataset: its own; the project's, for scenes that it renders itself."""
+    if dataset == "capture":
+        return "that of the capture's images, which only who took them can give"
     source = SOURCES.get(dataset)
     return f"{source.title}'s: {source.licence}; {source.terms}" if source else "Apache-2.0"
 

@@ -1,0 +1,209 @@
+"""Imported scenes: anyone's capture as ``tools/import_scene.py`` writes it.
+
+``SCENE/frames.csv`` has a row a frame, in the order of :data:`COLUMNS`: an image's path in the folder, the camera's
+``world_from_cam``, the split that it is in. ``SCENE/scene.json`` tells of cameras, units and what was decided.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mambaloc.data.frames import BadFrames, Frames, Split
+from mambaloc.errors import InputError
+from mambaloc.files import path_inside, read_json
+from mambaloc.geometry import canonical
+
+SCENE_FILE, FRAMES_FILE = "scene.json", "frames.csv"
+VERSION_KEY, VERSION = "mambaloc_scene", 1
+COLUMNS = ("image", "sequence", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz", "camera", "split")
+SPLITS = ("train", "val", "test", "unused")
+
+MOST_FRAMES = 200_000
+_MOST_METRES = 1e7  # beyond, float32 is off by a metre
+_UNIT_TOLERANCE = 1e-3
+_MOST_PIXELS = 32768
+_SAME_RATIO = 0.05
+_MEND = "import the scene again"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of ``frames.csv``, checked; ``pose`` is x, y, z, qw, qx, qy, qz."""
+
+    image: Path
+    sequence: str
+    pose: tuple[float, ...]
+    camera: str
+    split: str
+
+
+def is_captured(folder: Path) -> bool:
+    """Whether a folder is an imported scene, of whatever version."""
+    try:
+        told = json.loads((folder / SCENE_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(told, dict) and VERSION_KEY in told
+
+
+def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
+    """Read the posed frames of one split of a scene's folder; none, where it marks none for validation.
+
+    Raises:
+        InputError: for a malformed file, a scene that was found not usable, or a split without frames; and for a
+            missing image where ``bad`` says so.
+    """
+    _usable(folder)
+    rows = [row for row in read_rows(folder) if row.split == split]
+    kept = []
+    for row in rows:
+        if row.image.is_file():
+            kept.append(row)
+        else:
+            bad.reject(row.image, "pose without image")
+    if not kept and split != "val":
+        raise InputError(f"{folder / FRAMES_FILE}: has no usable frame of split {split}; {_MEND}, or mark some")
+    poses = np.array([row.pose for row in kept], dtype=np.float64).reshape(-1, 7)
+    return Frames(
+        tuple(row.image for row in kept),
+        tuple(row.sequence for row in kept),
+        poses[:, :3].copy(),
+        canonical(torch.from_numpy(poses[:, 3:].copy())).numpy(),
+    )
+
+
+def read_scene(folder: Path) -> dict[str, Any]:
+    """Read ``scene.json``.
+
+    Raises:
+        InputError: where it is none, or another version's.
+    """
+    path = folder / SCENE_FILE
+    told = read_json(path, _MEND, _MEND)
+    if not isinstance(told, dict) or VERSION_KEY not in told:
+        raise InputError(f"{path}: is not of an imported scene; make one with tools/import_scene.py")
+    if told[VERSION_KEY] != VERSION:
+        raise InputError(f"{path}: is of version {str(told[VERSION_KEY])[:20]}, this reads {VERSION}; {_MEND}")
+    return told
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """Read ``frames.csv``.
+
+    Raises:
+        InputError: for a row that is none, by its line.
+    """
+    path = folder / FRAMES_FILE
+    rows: list[Row] = []
+    lines: dict[Path, int] = {}
+    for line, told in _table(path):
+        row = _row(folder, told, f"{path}, line {line}")
+        if row.image in lines:
+            raise InputError(f"{path}, line {line}: {told['image']} is on line {lines[row.image]}, too; remove one")
+        lines[row.image] = line
+        rows.append(row)
+        if len(rows) > MOST_FRAMES:
+            raise InputError(f"{path}: has more than {MOST_FRAMES} rows; keep fewer")
+    if not rows:
+        raise InputError(f"{path}: has no row; {_MEND}")
+    return rows
+
+
+def focal_ratio_of(folder: Path) -> float | None:
+    """Focal length of the training frames' cameras over their images' width; None where they are unknown or differ.
+
+    Raises:
+        InputError: for a malformed file.
+    """
+    cameras = {name: _focal_ratio(folder, name, told) for name, told in _cameras(folder).items()}
+    named = {row.camera for row in read_rows(folder) if row.split == "train"}
+    if unknown := sorted(named - {"", *cameras}):
+        raise InputError(f"{folder / SCENE_FILE}: has no camera {unknown[0]!r}, which frames.csv names; {_MEND}")
+    if not named or "" in named:
+        return None
+    ratios = [cameras[name] for name in named]
+    middle = float(np.median(ratios))
+    return middle if max(ratios) - min(ratios) <= _SAME_RATIO * middle else None
+
+
+def describe_capture(folder: Path) -> dict[str, Any]:
+    """What an imported scene says of itself that a result must tell: its unit, where it is from, how it was split."""
+    told = read_scene(folder)
+    imported, split = (value if isinstance(value := told.get(key), dict) else {} for key in ("imported", "split"))
+    return {"unit": told.get("unit"), "format": imported.get("format"), "split_by": split.get("chosen")}
+
+
+def _usable(folder: Path) -> None:
+    sanity = read_scene(folder).get("sanity")
+    verdict = sanity.get("verdict") if isinstance(sanity, dict) else None
+    if isinstance(verdict, str) and verdict.startswith("not usable"):
+        raise InputError(f"{folder}: was found {verdict[:400]}; see report.md there, and {_MEND}")
+
+
+def _cameras(folder: Path) -> dict[str, Any]:
+    cameras = read_scene(folder).get("cameras")
+    if not isinstance(cameras, dict) or len(cameras) > MOST_FRAMES:
+        raise InputError(f"{folder / SCENE_FILE}: has no 'cameras', or too many; {_MEND}")
+    return cameras
+
+
+def _focal_ratio(folder: Path, name: str, told: Any) -> float:
+    try:
+        width, focal_px = float(told["width"]), float(told["focal_px"][0])
+    except (TypeError, ValueError, KeyError, IndexError, OverflowError):
+        width = focal_px = math.nan
+    if not (1 <= width <= _MOST_PIXELS and 0 < focal_px < math.inf):
+        raise InputError(f"{folder / SCENE_FILE}: camera {name!r} has no width and focal length in pixels; {_MEND}")
+    return focal_px / width
+
+
+def _table(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """Rows of a CSV file by column, each with its line."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            table = csv.reader(file, strict=True)
+            header = next(table, [])
+            if tuple(header) != COLUMNS:
+                raise InputError(f"{path}, line 1: is not {','.join(COLUMNS)}; {_MEND}")
+            for words in table:
+                if len(words) != len(COLUMNS):
+                    raise InputError(
+                        f"{path}, line {table.line_num}: has {len(words)} columns, not {len(COLUMNS)}; correct the row"
+                    )
+                yield table.line_num, dict(zip(COLUMNS, words, strict=True))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {_MEND}") from None
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: is no CSV ({error}); {_MEND}") from None
+
+
+def _row(folder: Path, told: dict[str, str], where: str) -> Row:
+    image = path_inside(folder, told["image"])
+    if image is None:
+        raise InputError(f"{where}: image {told['image'][:80]!r} is no path inside of the folder; correct the row")
+    if told["split"] not in SPLITS:
+        raise InputError(f"{where}: split {told['split'][:20]!r} is none of {', '.join(SPLITS)}; correct the row")
+    if not told["sequence"]:
+        raise InputError(f"{where}: names no sequence; correct the row")
+    numbers = ("x", "y", "z", "qw", "qx", "qy", "qz", *(["time_s"] if told["time_s"] else []))
+    try:
+        values = {name: float(told[name]) for name in numbers}
+    except ValueError:
+        raise InputError(f"{where}: {', '.join(numbers)} are not all numbers; correct the row") from None
+    if not all(math.isfinite(value) for value in values.values()):
+        raise InputError(f"{where}: has NaN or infinite numbers; correct the row")
+    pose = tuple(values[name] for name in numbers[:7])
+    if max(map(abs, pose[:3])) > _MOST_METRES:
+        raise InputError(f"{where}: lies farther than {_MOST_METRES:g} from the origin; shift the world towards it")
+    if abs(math.hypot(*pose[3:]) - 1) > _UNIT_TOLERANCE:
+        raise InputError(f"{where}: quaternion has length {math.hypot(*pose[3:]):.6g}, not 1; correct the row")
+    return Row(image, told["sequence"], pose, told["camera"], told["split"])

@@ -1,0 +1,141 @@
+"""``frames.csv`` and ``scene.json``: what :mod:`mambaloc.data.capture_scene` reads, and where all of it is from."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from mambaloc import provenance
+from mambaloc.data.capture_scene import COLUMNS, FRAMES_FILE, SCENE_FILE, VERSION, VERSION_KEY
+from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.findings import Finding, Verdict
+from mambaloc.importing.motion import quaternions
+from mambaloc.importing.splits import RULE, Chosen, Proposal
+
+POSE = (
+    "world_from_cam: x, y, z is the camera centre, qw, qx, qy, qz a unit quaternion with qw >= 0; OpenCV camera axes "
+    "(x right, y down, z forward)"
+)
+_UNKNOWN = "unknown: figures that are printed as metres are units of this scene"
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A capture as it goes into a scene's folder, and all that was found.
+
+    Args:
+        capture: posed images in the folder; positions in the scene's unit and origin.
+        lenses: the cameras as the source has them, by name.
+        split: of each frame.
+        findings: of the checks.
+        verdict: what they come to.
+        proposals: ways to split; empty where nothing can be split.
+        chosen: the one that was taken.
+        left_out: the rule that each frame that was left out breaks, by file.
+    """
+
+    capture: Capture
+    lenses: Mapping[str, Camera]
+    split: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    verdict: Verdict
+    proposals: tuple[Proposal, ...]
+    chosen: Chosen | None
+    left_out: Mapping[str, str]
+
+    @property
+    def unit(self) -> str:
+        """How a length's unit is written."""
+        return "m" if self.capture.unit == "metre" else "units"
+
+
+def write_frames(imported: Imported, folder: Path) -> None:
+    """Write ``frames.csv``; numbers as exactly as they are known."""
+    capture = imported.capture
+    poses = zip(capture.world_from_cam[:, :3, 3].tolist(), quaternions(capture).tolist(), strict=True)
+    with (folder / FRAMES_FILE).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for row, (position, quaternion) in enumerate(poses):
+            time_s = "" if capture.time_s is None else repr(float(capture.time_s[row]))
+            camera = "" if capture.camera_of is None else capture.camera_of[row]
+            image = capture.images[row].relative_to(folder).as_posix()
+            pose = [repr(number) for number in (*position, *quaternion)]
+            writer.writerow([image, capture.sequences[row] or "all", time_s, *pose, camera, imported.split[row]])
+
+
+def write_scene(imported: Imported, folder: Path, source: Path, command: str) -> None:
+    """Write ``scene.json``.
+
+    Args:
+        imported: what to tell.
+        folder: where to.
+        source: that it was made of.
+        command: that made it.
+    """
+    capture = imported.capture
+    told = {
+        VERSION_KEY: VERSION,
+        "imported": {
+            "source": str(source),
+            "format": capture.kind,
+            "command": command,
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "version": provenance.versions()["mambaloc"],
+            "commit": provenance.commit(),
+        },
+        "pose": POSE,
+        "unit": "metre" if capture.unit == "metre" else _UNKNOWN,
+        "choices": dict(capture.choices),
+        "cameras": {name: _described(camera, imported.lenses[name]) for name, camera in capture.cameras.items()},
+        "frames": {
+            "used": len(capture.images),
+            "poses_without_image": len(capture.poses_without_image),
+            "images_without_pose": len(capture.images_without_pose),
+            "left_out": dict(imported.left_out),
+        },
+        "sanity": {
+            "verdict": str(imported.verdict),
+            "checks": {
+                finding.name: {
+                    "found": finding.said,
+                    **({"concern": finding.concern} if finding.concern else {}),
+                    **finding.figures,
+                }
+                for finding in imported.findings
+            },
+        },
+        "split": _split(imported),
+    }
+    (folder / SCENE_FILE).write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _described(camera: Camera, lens: Camera) -> dict[str, Any]:
+    told: dict[str, Any] = {
+        "width": camera.width,
+        "height": camera.height,
+        "focal_px": list(camera.focal_px),
+        "centre_px": list(camera.centre_px),
+    }
+    if lens.distorted is None:
+        return {**told, "images": "as they were: the camera is a pinhole", "model": lens.model}
+    was = {"model": lens.model, "focal_px": list(lens.focal_px), "centre_px": list(lens.centre_px)}
+    zoom = camera.focal_px[0] / lens.focal_px[0]
+    return {**told, "images": f"distortion removed; zoomed by {zoom:.4f}, so that no border is black", "lens": was}
+
+
+def _split(imported: Imported) -> dict[str, Any]:
+    if imported.chosen is None:
+        return {"chosen": None, "why": "nothing can be split"}
+    return {
+        "chosen": imported.chosen.proposal.kind,
+        "why": imported.chosen.why,
+        **({"warning": imported.chosen.warning} if imported.chosen.warning else {}),
+        "rule": RULE,
+        "proposals": [proposal.figures() for proposal in imported.proposals],
+    }

@@ -1,0 +1,67 @@
+"""What every reader of a foreign format gives: posed images in this project's conventions, and what was decided."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Unit = Literal["metre", "unknown"]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of a capture's camera, in pixels of its images; the centre of the top-left pixel is (0, 0).
+
+    Args:
+        width: of its images.
+        height: likewise.
+        focal_px: along x and y.
+        centre_px: principal point, x and y.
+        distorted: pixels (N, 2) of rays (N, 2), which are ``x / z`` and ``y / z``; None for a pinhole.
+        model: what the format calls it.
+    """
+
+    width: int
+    height: int
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    distorted: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    model: str = "pinhole"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Posed images, sequence after sequence, each in the order it was taken.
+
+    Args:
+        kind: the format, as :data:`mambaloc.importing.formats.FORMATS` names it.
+        images: N files, all there.
+        sequences: N names of recordings.
+        world_from_cam: (N, 4, 4) float64, OpenCV camera axes.
+        unit: of positions: ``unknown`` where the format's scale is arbitrary.
+        choices: what was decided of axes, direction, scale and origin, and why, by name; goes into ``scene.json``.
+        cameras: by name; empty where the format tells of none.
+        camera_of: N names, or None where the format tells of none.
+        time_s: (N,) where the format tells of it.
+        split: N of ``train``, ``val``, ``test`` where the format tells of them.
+        poses_without_image: what the format names and is not there.
+        images_without_pose: images beside those used.
+    """
+
+    kind: str
+    images: tuple[Path, ...]
+    sequences: tuple[str, ...]
+    world_from_cam: NDArray[np.float64]
+    unit: Unit
+    choices: Mapping[str, str]
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    camera_of: tuple[str, ...] | None = None
+    time_s: NDArray[np.float64] | None = None
+    split: tuple[str, ...] | None = None
+    poses_without_image: tuple[str, ...] = ()
+    images_without_pose: tuple[Path, ...] = ()

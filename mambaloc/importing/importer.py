@@ -1,0 +1,148 @@
+"""From a capture in anyone's format to a scene that every recipe trains on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from mambaloc.errors import InputError
+from mambaloc.files import whole_folder
+from mambaloc.importing import sanity
+from mambaloc.importing.advisor import propose
+from mambaloc.importing.canonical import Imported, write_frames, write_scene
+from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.conventions import check_agreement, check_axes, check_up, up_of
+from mambaloc.importing.epipolar import agreement
+from mambaloc.importing.findings import Finding, verdict_of
+from mambaloc.importing.formats import read_capture
+from mambaloc.importing.motion import motion_of
+from mambaloc.importing.pictures import Size, selected, write_pictures
+from mambaloc.importing.report import write_report
+from mambaloc.importing.splits import ASKED, Chosen, Proposal, choose
+
+_MOST_SCALE = 1e6
+_FAR = 1000.0
+"""Extents from the origin, beyond which it is shifted: float32 would be off by a ten-thousandth of the extent."""
+
+
+def import_scene(
+    source: Path,
+    out: Path,
+    kind: str | None = None,
+    metres_per_unit: float | None = None,
+    split: str = "auto",
+    command: str = "",
+) -> Imported:
+    """Read a capture, check it, split it, and write it as a scene's folder, which appears once it is whole.
+
+    Args:
+        source: the capture.
+        out: the scene's folder, which must not be there yet.
+        kind: the capture's format; found out unless given.
+        metres_per_unit: what the format's unit is; as the format tells unless given.
+        split: of :data:`~mambaloc.importing.splits.ASKED`.
+        command: that this was asked for with.
+
+    Raises:
+        InputError: for a source that is none, a folder that is there or cannot be written, or a split that cannot be
+            made.
+    """
+    if out.exists():
+        raise InputError(f"{out}: is there already, and no scene is overwritten; remove it, or choose another --out")
+    if split not in ASKED:
+        raise InputError(f"--split {split}: choose one of {', '.join(ASKED)}")
+    if metres_per_unit is not None and not 1 / _MOST_SCALE <= metres_per_unit <= _MOST_SCALE:
+        raise InputError(
+            f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
+        )
+    capture = read_capture(source, kind)
+    broken = sanity.bad_poses(capture.world_from_cam)
+    left_out = {str(capture.images[row]): rule for row, rule in broken.items()}
+    capture = selected(capture, [row for row in range(len(capture.images)) if row not in broken])
+    capture = _near_the_origin(_in_metres(capture, metres_per_unit))
+    with whole_folder(out, "choose another folder with --out") as partial:
+        written, sizes, rules = write_pictures(capture, partial)
+        imported = _checked(written, capture.cameras, sizes, {**left_out, **rules}, split)
+        write_frames(imported, partial)
+        write_report(imported, partial, out.name)
+        write_scene(imported, partial, source, command)
+    return imported
+
+
+def _in_metres(capture: Capture, metres_per_unit: float | None) -> Capture:
+    if metres_per_unit is None:
+        return capture
+    world_from_cam = capture.world_from_cam.copy()
+    world_from_cam[:, :3, 3] *= metres_per_unit
+    told = (
+        f"multiplied by {metres_per_unit:g}, as --metres-per-unit says; otherwise: {capture.choices.get('scale', '')}"
+    )
+    return replace(capture, world_from_cam=world_from_cam, unit="metre", choices={**capture.choices, "scale": told})
+
+
+def _near_the_origin(capture: Capture) -> Capture:
+    """Shift a world whose origin is so far away that float32 would blur it, as a map's is."""
+    position = capture.world_from_cam[:, :3, 3]
+    middle = np.median(position, axis=0).round() if len(position) else np.zeros(3)
+    extent = float(np.linalg.norm(np.ptp(position, axis=0))) if len(position) else 0.0
+    if np.linalg.norm(middle) <= _FAR * max(extent, 1e-3):
+        return replace(capture, choices={"origin": "as in the source", **capture.choices})
+    world_from_cam = capture.world_from_cam.copy()
+    world_from_cam[:, :3, 3] -= middle
+    told = f"shifted to {middle.tolist()} of the source's world, so that float32 holds the positions"
+    return replace(capture, world_from_cam=world_from_cam, choices={**capture.choices, "origin": told})
+
+
+def _checked(
+    capture: Capture, lenses: Mapping[str, Camera], sizes: Sequence[Size], left_out: Mapping[str, str], asked: str
+) -> Imported:
+    """Check what was written, and split what can be used of it."""
+    usable = _of_the_usual_shape(sizes)
+    odd = len(sizes) - len(usable)
+    findings = [sanity.check_frames(len(usable), left_out), sanity.check_missing(capture)]
+    proposals: list[Proposal] = []
+    chosen: Chosen | None = None
+    split = np.full(len(capture.images), "unused", dtype="<U6")
+    if not any(finding.is_fatal for finding in findings):
+        used = selected(capture, usable)
+        findings += [sanity.check_sizes(sizes, odd), *_of_poses(used)]
+        if not any(finding.is_fatal for finding in findings):
+            proposals = propose(used, motion_of(used))
+            chosen = choose(proposals, asked)
+            split[usable] = chosen.proposal.split
+            findings.append(Finding("split", f"by {chosen.proposal.kind}: {chosen.proposal.how}", chosen.warning))
+    return Imported(
+        capture=capture,
+        lenses=lenses,
+        split=tuple(split.tolist()),
+        findings=tuple(findings),
+        verdict=verdict_of(findings),
+        proposals=tuple(proposals),
+        chosen=chosen,
+        left_out=left_out,
+    )
+
+
+def _of_poses(capture: Capture) -> list[Finding]:
+    motion, unit = motion_of(capture), "m" if capture.unit == "metre" else "units"
+    return [
+        check_agreement(agreement(capture, motion)),
+        check_up(capture, up_of(capture)),
+        check_axes(capture),
+        sanity.check_extent(capture, motion, unit),
+        sanity.check_steps(capture, motion, unit),
+        sanity.check_duplicates(capture, motion),
+        sanity.check_times(capture),
+    ]
+
+
+def _of_the_usual_shape(sizes: Sequence[Size]) -> list[int]:
+    """Rows of images of the most common ratio of sides: a training has one crop for all."""
+    shapes = [Fraction(*size) for size in sizes]
+    usual = Counter(shapes).most_common(1)[0][0] if shapes else None
+    return [row for row, shape in enumerate(shapes) if shape == usual]

@@ -1,0 +1,106 @@
+"""How a capture's camera moved from frame to frame, and how far apart any two frames are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mambaloc.geometry import quaternion_from_matrix, rotation_error_deg
+from mambaloc.importing.capture import Capture
+
+Floats = NDArray[np.float64]
+
+_JUMP_STEPS = 10.0
+_JUMP_SHARE = 0.02  # of the extent: a camera that hardly moves makes no jumps
+_JUMP_DEG = 45.0
+_LONGEST_STEP = 0.25  # of the extent: a path's steps are shorter; two frames drawn at random lie farther apart
+_LEAST_STEP = 1e-4  # of the extent
+_LEAST_DEG = 0.05
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Steps from each frame to the next of its sequence.
+
+    Args:
+        later: (M,), the row of each step's second frame.
+        length: (M,), in the capture's unit.
+        turn_deg: (M,).
+        extent: length of the diagonal of the box that holds nine tenths of the camera centres along each axis.
+        step: how far neighbours are apart: the median step, or, where frames come in no order, the median distance to
+            the nearest frame.
+        step_deg: likewise.
+        in_order: whether the frames follow a path.
+        jumps: rows of frames that the camera cannot have reached.
+    """
+
+    later: NDArray[np.int64]
+    length: Floats
+    turn_deg: Floats
+    extent: float
+    step: float
+    step_deg: float
+    in_order: bool
+    jumps: NDArray[np.int64]
+
+
+def motion_of(capture: Capture) -> Motion:
+    """Measure the steps of a capture of two frames or more."""
+    position, quaternion = capture.world_from_cam[:, :3, 3], quaternions(capture)
+    names = np.array(capture.sequences)
+    later = 1 + np.flatnonzero(names[1:] == names[:-1])
+    length = np.linalg.norm(position[later] - position[later - 1], axis=1)
+    turn_deg = _angles_deg(quaternion[later], quaternion[later - 1])
+    low, high = np.percentile(position, (5, 95), axis=0)
+    extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(position, axis=0)))
+    in_order = len(later) > 0 and float(np.median(length)) <= _LONGEST_STEP * extent
+    if in_order:
+        step, step_deg = float(np.median(length)), float(np.median(turn_deg))
+    else:
+        step, step_deg = _to_nearest(position, quaternion)
+    far = (length > _JUMP_STEPS * step) & (length > _JUMP_SHARE * extent)
+    jumps = far | ((turn_deg > _JUMP_STEPS * step_deg) & (turn_deg > _JUMP_DEG))
+    return Motion(
+        later,
+        length,
+        turn_deg,
+        extent,
+        max(step, _LEAST_STEP * extent, 1e-12),
+        max(step_deg, _LEAST_DEG),
+        in_order,
+        later[jumps] if in_order else later[:0],
+    )
+
+
+def quaternions(capture: Capture) -> Floats:
+    """Rotations of a capture's cameras, canonical wxyz, (N, 4)."""
+    return quaternion_from_matrix(torch.from_numpy(capture.world_from_cam[:, :3, :3].copy())).numpy()
+
+
+def apart(
+    position: Floats, quaternion: Floats, rows: NDArray[np.int64], others: NDArray[np.int64]
+) -> tuple[Floats, Floats]:
+    """How far each of some frames is from each of others: lengths and degrees, (R, O) each."""
+    length = np.linalg.norm(position[rows][:, None] - position[others], axis=-1)
+    cosine = np.abs(quaternion[rows] @ quaternion[others].T).clip(max=1.0)
+    return length, np.degrees(2 * np.arccos(cosine))
+
+
+def _to_nearest(position: Floats, quaternion: Floats) -> tuple[float, float]:
+    """Medians of the distance to the nearest other frame, and of how far that is turned."""
+    lengths, turns = [], []
+    everything = np.arange(len(position))
+    for row in everything[:: max(1, len(everything) // 1000)]:
+        length, turn_deg = (each[0] for each in apart(position, quaternion, everything[row : row + 1], everything))
+        length[row] = np.inf
+        nearest = int(length.argmin())
+        lengths.append(length[nearest])
+        turns.append(turn_deg[nearest])
+    return float(np.median(lengths)), float(np.median(turns))
+
+
+def _angles_deg(a: Floats, b: Floats) -> Floats:
+    return rotation_error_deg(torch.from_numpy(a), torch.from_numpy(b)).numpy()

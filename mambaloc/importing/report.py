@@ -1,0 +1,143 @@
+"""What was found, for people: ``report.md`` and ``trajectory.png`` in the scene's folder, a table in the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from mambaloc.importing.canonical import Imported
+from mambaloc.importing.conventions import up_of
+from mambaloc.importing.motion import motion_of
+from mambaloc.importing.splits import RULE, Proposal
+from mambaloc.viz import draw_capture
+
+REPORT_FILE, PLOT_FILE = "report.md", "trajectory.png"
+_IN_TERMINAL = ("frames", "poses", "images and poses", "up", "steps", "extent")
+
+
+def write_report(imported: Imported, folder: Path, name: str) -> None:
+    """Write ``report.md`` and ``trajectory.png``.
+
+    Args:
+        imported: what was found.
+        folder: where to.
+        name: of the scene.
+    """
+    (folder / REPORT_FILE).write_text(_page(imported, name), encoding="utf-8")
+    capture = imported.capture
+    if len(capture.images) < 2:
+        return
+    up, motion = up_of(capture), motion_of(capture)
+    by = f", split by {imported.chosen.proposal.kind}" if imported.chosen else ""
+    draw_capture(
+        capture.world_from_cam[:, :3, 3],
+        capture.world_from_cam[:, :3, 2],
+        up.direction if up.world_axis is None else up.world_axis,
+        imported.split,
+        capture.sequences,
+        motion.jumps.tolist(),
+        folder / PLOT_FILE,
+        f"{name}: {len(capture.images)} frames{by}",
+        imported.unit,
+    )
+
+
+def print_summary(imported: Imported, folder: Path) -> None:
+    """Print the verdict, what it rests on, and the proposals."""
+    console = Console(highlight=False)
+    lead, reasons = imported.verdict.in_words()
+    for line in (f"{folder}: {lead}", *(f"- {reason}" for reason in reasons)):
+        console.print(line, soft_wrap=True, markup=False)
+    found = {finding.name: finding.said for finding in imported.findings}
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name in _IN_TERMINAL:
+        if name in found:
+            table.add_row(name, found[name])
+    console.print(table, markup=False)
+    if imported.chosen is None:
+        return
+    console.print(_proposals(imported))
+    console.print(f"chosen: {imported.chosen.proposal.kind}, {imported.chosen.why}", soft_wrap=True)
+    training = f"python tools/train.py recipes/my_scene.yaml --data.scene {folder}"
+    console.print(f"wrote {folder}: {REPORT_FILE}, {PLOT_FILE}; next: {training}", soft_wrap=True, markup=False)
+
+
+_TABLE_TITLE = "from test frames to the nearest training frame"
+
+
+def _proposals(imported: Imported) -> Table:
+    """Three lines a proposal: distances in the capture's unit, in degrees, in steps."""
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title=_TABLE_TITLE, title_justify="left")
+    for column in ("split by", "train/val/test", "near", "", "", "10 %", "median", "90 %"):
+        table.add_column(column, justify="right" if column[-1:] in ("%", "n") or column == "near" else "left")
+    for proposal in imported.proposals:
+        style = "bold" if imported.chosen and proposal is imported.chosen.proposal else ""
+        names: tuple[str, ...] = (proposal.kind, _counts(proposal), f"{proposal.near:.0%}", _quality(proposal))
+        for unit, told in _told(proposal, imported.unit).items():
+            table.add_row(*names, unit, *map(_short, told), style=style)
+            names = ("", "", "", "")
+    return table
+
+
+def _told(proposal: Proposal, unit: str) -> dict[str, tuple[float, float, float]]:
+    return {unit: proposal.length, "deg": proposal.turn_deg, "steps": proposal.steps}
+
+
+def _counts(proposal: Proposal) -> str:
+    return "/".join(str(proposal.counts[split]) for split in ("train", "val", "test"))
+
+
+def _quality(proposal: Proposal) -> str:
+    faults = [word for word, holds in (("leaks", not proposal.is_honest), ("far", not proposal.is_learnable)) if holds]
+    return ", ".join(faults) or "good"
+
+
+def _spans(proposal: Proposal) -> list[str]:
+    return [f"{_short(b)} ({_short(a)} to {_short(c)})" for a, b, c in _told(proposal, "").values()]
+
+
+def _short(number: float) -> str:
+    return f"{number:.0f}" if number >= 99.5 else f"{number:.2g}"
+
+
+def _page(imported: Imported, name: str) -> str:
+    capture = imported.capture
+    parts = [f"# {name}", _verdict(imported), f"![Cameras from above and from the side]({PLOT_FILE})", "## Found"]
+    parts.append(_table(("check", "found"), [(finding.name, finding.said) for finding in imported.findings]))
+    parts.append("## Split")
+    if imported.chosen is None:
+        parts.append("None: nothing can be split.")
+    else:
+        chosen = imported.chosen
+        parts.append(f"By **{chosen.proposal.kind}**: {chosen.proposal.how}; {chosen.why}.")
+        parts += [f"**Warning:** {chosen.warning}."] if chosen.warning else []
+        parts.append(f"{_TABLE_TITLE[0].upper()}{_TABLE_TITLE[1:]}: median (10 % to 90 %).")
+        header = ("split by", "train/val/test", "near", "", *_told(chosen.proposal, imported.unit))
+        rows = [
+            (each.kind, _counts(each), f"{each.near:.0%}", _quality(each), *_spans(each)) for each in imported.proposals
+        ]
+        parts.append(_table(header, rows))
+        parts += [f"- {proposal.kind}: {proposal.how}" for proposal in imported.proposals]
+        parts.append(RULE)
+    parts.append("## Decided")
+    unit = "metres" if capture.unit == "metre" else "unknown: figures printed as metres are units of this scene"
+    parts.append(_table(("of", "decided"), [("format", capture.kind), ("unit", unit), *capture.choices.items()]))
+    if imported.left_out:
+        parts.append("## Left out")
+        parts.append(_table(("image", "rule"), [(Path(file).name, rule) for file, rule in imported.left_out.items()]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _verdict(imported: Imported) -> str:
+    lead, reasons = imported.verdict.in_words()
+    return "\n".join([f"**{lead}**", "", *(f"- {reason}" for reason in reasons)]).strip()
+
+
+def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [header, tuple("---" for _ in header), *rows]
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in line) + " |" for line in lines
+    )

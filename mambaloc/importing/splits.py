@@ -1,0 +1,185 @@
+"""Ways to split a capture, each measured, and the rule that chooses one.
+
+A test frame beside a training frame tests memory; one that is nowhere near any tests luck. So every proposal says how
+far its test frames are from their nearest training frame, in steps of the capture: the larger of the distance in median
+steps and the turn in median turns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.importing.capture import Capture
+from mambaloc.importing.motion import Motion, apart, quaternions
+
+Kind = Literal["given", "sequence", "loop", "block"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+"""In the order in which the rule prefers them: other recordings are most like what comes later."""
+ASKED = ("auto", *KINDS)
+
+NEAR_STEPS = 2.0
+MOST_NEAR = 0.1
+REACH = 0.25
+REACH_DEG = 30.0
+RULE = (
+    f"A proposal is honest where at most {MOST_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
+    f"training frame, and learnable where the median test frame's nearest one is within {REACH:.0%} of the scene's "
+    f"extent and {REACH_DEG:g}°. The first that is both is taken, in the order {', '.join(KINDS)}; failing that, the "
+    "one with the fewest near frames of those that are learnable, or of all, and then the nearest."
+)
+
+_MEASURED = 400  # test frames at most, evenly spread
+
+Quantiles = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A way to split a capture.
+
+    Args:
+        kind: by what.
+        how: in a line.
+        split: ``train``, ``val``, ``test`` or ``unused``, of each frame.
+        length: from each test frame to its nearest training frame: 10 % quantile, median and 90 % quantile.
+        turn_deg: likewise.
+        steps: likewise.
+        near: share of test frames within :data:`NEAR_STEPS` steps.
+        is_learnable: the median is within reach.
+    """
+
+    kind: Kind
+    how: str
+    split: NDArray[np.str_]
+    length: Quantiles
+    turn_deg: Quantiles
+    steps: Quantiles
+    near: float
+    is_learnable: bool
+
+    @property
+    def is_honest(self) -> bool:
+        """Whether hardly any test frame is a training frame's neighbour."""
+        return self.near <= MOST_NEAR
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it is honest and learnable."""
+        return self.is_honest and self.is_learnable
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Frames of each split."""
+        return {split: int((self.split == split).sum()) for split in ("train", "val", "test", "unused")}
+
+    def figures(self) -> Mapping[str, Any]:
+        """What ``scene.json`` tells of it."""
+        quantiles = {"length": self.length, "turn_deg": self.turn_deg, "steps": self.steps}
+        return {
+            "by": self.kind,
+            "how": self.how,
+            "frames": self.counts,
+            "test_to_nearest_train": {
+                name: dict(zip(("10%", "median", "90%"), (round(each, 5) for each in told), strict=True))
+                for name, told in quantiles.items()
+            },
+            f"within_{NEAR_STEPS:g}_steps": round(self.near, 4),
+            "honest": self.is_honest,
+            "learnable": self.is_learnable,
+        }
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A proposal, why it was taken, and what is wrong with it still; empty where nothing is."""
+
+    proposal: Proposal
+    why: str
+    warning: str
+
+
+def choose(proposals: Sequence[Proposal], asked: str) -> Chosen:
+    """Take a proposal: the one asked for, or by :data:`RULE`.
+
+    Args:
+        proposals: in the order of :data:`KINDS`.
+        asked: of :data:`ASKED`.
+
+    Raises:
+        InputError: where there is none of the kind that was asked for.
+    """
+    if asked != "auto":
+        taken = next((each for each in proposals if each.kind == asked), None)
+        if taken is None:
+            there = ", ".join(each.kind for each in proposals)
+            raise InputError(f"--split {asked}: this capture has {_LACKS[asked]}; choose one of auto, {there}")
+        return Chosen(taken, "it was asked for", _warning(taken))
+    taken = next((each for each in proposals if each.is_good), None) or best_of(proposals)
+    why = (
+        "the first that is honest and learnable"
+        if taken.is_good
+        else "none is both honest and learnable, it comes nearest"
+    )
+    return Chosen(taken, why, _warning(taken))
+
+
+_LACKS = {
+    "given": "no split of its own",
+    "sequence": "one sequence",
+    "loop": "no path that comes back",
+    "block": "too few frames",
+}
+
+
+def best_of(proposals: Sequence[Proposal]) -> Proposal:
+    """The one with the fewest near frames of those that are learnable, or of all; among honest ones, the nearest."""
+    return min(proposals, key=lambda each: (not each.is_learnable, max(each.near, MOST_NEAR), each.steps[1]))
+
+
+def measured(kind: Kind, how: str, split: NDArray[np.str_], capture: Capture, motion: Motion) -> Proposal:
+    """Measure how far test frames are from training frames."""
+    test, train = np.flatnonzero(split == "test"), np.flatnonzero(split == "train")
+    length, turn_deg, steps = distances(capture, motion, test, train)
+    is_learnable = bool(np.median(length) <= REACH * motion.extent and np.median(turn_deg) <= REACH_DEG)
+    near = float((steps <= NEAR_STEPS).mean())
+    return Proposal(kind, how, split, _quantiles(length), _quantiles(turn_deg), _quantiles(steps), near, is_learnable)
+
+
+def distances(
+    capture: Capture, motion: Motion, rows: NDArray[np.int64], others: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """From each of some frames to the nearest of others: lengths, degrees and steps, (R,) each.
+
+    Of more than a few hundred, evenly spread ones are measured.
+    """
+    rows = rows[np.linspace(0, len(rows) - 1, min(_MEASURED, len(rows))).round().astype(int)]
+    length, turn_deg = apart(capture.world_from_cam[:, :3, 3], quaternions(capture), rows, others)
+    steps = np.maximum(length / motion.step, turn_deg / motion.step_deg)
+    nearest = steps.argmin(axis=1)
+    every = np.arange(len(rows))
+    return length[every, nearest], turn_deg[every, nearest], steps[every, nearest]
+
+
+def _quantiles(values: NDArray[np.float64]) -> Quantiles:
+    low, middle, high = np.quantile(values, (0.1, 0.5, 0.9)).tolist()
+    return low, middle, high
+
+
+def _warning(taken: Proposal) -> str:
+    if not taken.is_honest:
+        return (
+            f"the split by {taken.kind} leaks: {taken.near:.0%} of test frames are within {NEAR_STEPS:g} steps of a "
+            "training frame, so test errors will look better than those between the frames"
+        )
+    if not taken.is_learnable:
+        return (
+            f"the split by {taken.kind} asks much: half of its test frames are {taken.steps[1]:.0f} steps or more "
+            f"({taken.turn_deg[1]:.0f}°) from any training frame; record more passes"
+        )
+    return ""

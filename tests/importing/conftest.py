@@ -1,0 +1,59 @@
+"""Captures made by hand and by the renderer: poses that are known, and pictures that are right for them."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from captures import FLIP, FOCAL_PX, LENS, SIZE, Rendered
+
+from mambaloc.data.rendering import Room, embedded_room, embedded_walk, render
+
+
+@pytest.fixture(scope="session")
+def room() -> Room:
+    """The embedded room."""
+    return embedded_room()
+
+
+@pytest.fixture(scope="session")
+def rendered_once(room, tmp_path_factory) -> Rendered:
+    """Forty frames of a walk, distorted by OpenCV's own inverse of the lens."""
+    folder = tmp_path_factory.mktemp("captures") / "room"
+    (folder / "images").mkdir(parents=True)
+    walk = embedded_walk(40, seed=3, start_deg=20.0, step_deg=2.4)
+    centre = ((SIZE[0] - 1) / 2 + 1.5, (SIZE[1] - 1) / 2 - 1.0)
+    matrix = np.array([[FOCAL_PX, 0, centre[0]], [0, FOCAL_PX, centre[1]], [0, 0, 1]])
+    coefficients = np.array([*LENS.values()])
+    columns, rows = np.meshgrid(np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32))
+    pixels = np.stack((columns, rows), axis=-1).reshape(-1, 1, 2)
+    rays = cv2.undistortPoints(pixels, matrix, coefficients).reshape(SIZE[1], SIZE[0], 2)
+    wide = np.array([[1.5 * FOCAL_PX, 0, SIZE[0]], [0, 1.5 * FOCAL_PX, SIZE[1]], [0, 0, 1]])
+    where = (rays * 1.5 * FOCAL_PX + SIZE).astype(np.float32)
+    frames = []
+    for number, world_from_cam in enumerate(walk):
+        rgb, _ = render(room, wide, world_from_cam, (2 * SIZE[0], 2 * SIZE[1]))
+        seen = cv2.remap(rgb, where[..., 0], where[..., 1], cv2.INTER_LINEAR)
+        cv2.imwrite(str(folder / f"images/{number + 1:04d}.png"), seen[..., ::-1])
+        frames.append(
+            {"file_path": f"images/{number + 1:04d}.png", "transform_matrix": (world_from_cam @ FLIP).tolist()}
+        )
+    told = {
+        "fl_x": FOCAL_PX, "fl_y": FOCAL_PX, "cx": centre[0] + 0.5, "cy": centre[1] + 0.5, "w": SIZE[0], "h": SIZE[1],
+        **LENS, "camera_model": "OPENCV", "frames": frames,
+    }  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps(told))
+    return Rendered(folder, walk, matrix, coefficients)
+
+
+@pytest.fixture
+def rendered(rendered_once, tmp_path) -> Rendered:
+    """The same, in a folder that a test may change."""
+    folder = tmp_path / "room"
+    (folder / "images").mkdir(parents=True)
+    (folder / "transforms.json").write_bytes((rendered_once.folder / "transforms.json").read_bytes())
+    for image in (rendered_once.folder / "images").iterdir():
+        (folder / "images" / image.name).symlink_to(image)
+    return Rendered(folder, rendered_once.world_from_cam, rendered_once.matrix, rendered_once.coefficients)

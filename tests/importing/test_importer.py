@@ -1,0 +1,307 @@
+"""From ``transforms.json`` to a scene's folder and back, and the tool used rightly and wrongly."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from captures import FOCAL_PX, SIZE
+from scipy.spatial.transform import Rotation
+
+from mambaloc.data.capture_scene import COLUMNS, read_rows, read_split
+from mambaloc.data.frames import BadFrames
+from mambaloc.data.rendering import render
+from mambaloc.errors import InputError
+from mambaloc.images import read_image
+from mambaloc.importing.canonical import Imported
+from mambaloc.importing.capture import Camera
+from mambaloc.importing.formats import FORMATS, Format, read_capture
+from mambaloc.importing.importer import import_scene
+from mambaloc.importing.pictures import selected, write_pictures
+
+TOOL = Path(__file__).parents[2] / "tools" / "import_scene.py"
+
+
+@pytest.fixture(scope="session")
+def scene(rendered_once, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("imported") / "room"
+    import_scene(rendered_once.folder, folder, command="python tools/import_scene.py room")
+    return folder
+
+
+def told(folder):
+    return json.loads((folder / "scene.json").read_text())
+
+
+def tool(*words):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["tools/import_scene.py", *map(str, words)])
+        runpy.run_path(str(TOOL), run_name="__main__")
+
+
+# --- the scene -------------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_holds_what_it_should(scene):
+    assert sorted(path.name for path in scene.iterdir()) == [
+        "frames.csv", "images", "report.md", "scene.json", "trajectory.png",
+    ]  # fmt: skip
+    assert scene.stat().st_mode & 0o777 == 0o755
+    assert read_image(scene / "trajectory.png").shape[0] > 200
+
+
+def test_poses_come_back_as_they_were(scene, rendered_once):
+    rows = read_rows(scene)
+    assert [row.image.name for row in rows] == [f"{number + 1:04d}.png" for number in range(40)]
+    poses = np.array([row.pose for row in rows])
+    np.testing.assert_allclose(poses[:, :3], rendered_once.world_from_cam[:, :3, 3], atol=1e-12)
+    expected = Rotation.from_matrix(rendered_once.world_from_cam[:, :3, :3])
+    found = Rotation.from_quat(poses[:, [4, 5, 6, 3]])
+    assert np.degrees((expected.inv() * found).magnitude()).max() < 1e-6
+    assert (poses[:, 3] >= 0).all()
+
+
+def test_undistorted_images_are_those_of_the_pinhole_that_is_told(scene, rendered_once, room):
+    (camera,) = told(scene)["cameras"].values()
+    assert (camera["width"], camera["height"]) == SIZE
+    assert camera["lens"]["model"] == "OPENCV"
+    assert "distortion removed" in camera["images"]
+    matrix = np.array(
+        [
+            [camera["focal_px"][0], 0, camera["centre_px"][0]],
+            [0, camera["focal_px"][1], camera["centre_px"][1]],
+            [0, 0, 1],
+        ]
+    )
+    assert not np.isclose(camera["focal_px"][0], FOCAL_PX, rtol=1e-3)
+    for row in (0, 13, 39):
+        seen = read_image(scene / f"images/images/{row + 1:04d}.png").astype(float)
+        expected, _ = render(room, matrix, rendered_once.world_from_cam[row], SIZE)
+        distorted = read_image(rendered_once.folder / f"images/{row + 1:04d}.png")
+        by_opencv = cv2.undistort(distorted, rendered_once.matrix, rendered_once.coefficients, None, matrix)
+        inside = (slice(2, -2), slice(2, -2))
+        error, of_opencv = (np.abs(each - expected)[inside].mean() for each in (seen, by_opencv.astype(float)))
+        assert error < 6
+        assert error < 1.05 * of_opencv + 0.1
+        assert error < 0.7 * np.abs(distorted.astype(float) - expected)[inside].mean()
+        assert (seen.max(axis=-1) > 0).all()  # no border is black
+
+
+def test_scene_json_says_where_all_is_from(scene, rendered_once):
+    said = told(scene)
+    assert said["mambaloc_scene"] == 1
+    imported = said["imported"]
+    assert imported["format"] == "nerfstudio"
+    assert imported["source"] == str(rendered_once.folder)
+    assert imported["command"] == "python tools/import_scene.py room"
+    assert {"version", "commit", "date"} <= imported.keys()
+    assert said["unit"].startswith("unknown: figures that are printed as metres are units")
+    assert {"axes", "direction", "world", "scale", "origin", "order", "cameras"} <= said["choices"].keys()
+    assert said["frames"] == {"used": 40, "poses_without_image": 0, "images_without_pose": 0, "left_out": {}}
+    assert said["sanity"]["checks"]["images and poses"]["share"]["as they were read"] > 0.6
+    assert said["sanity"]["checks"]["up"]["axis"] == "+z"
+    proposals = {each["by"]: each for each in said["split"]["proposals"]}
+    assert said["split"]["chosen"] in proposals
+    for each in proposals.values():
+        assert set(each["test_to_nearest_train"]) == {"length", "turn_deg", "steps"}
+        assert set(each["test_to_nearest_train"]["steps"]) == {"10%", "median", "90%"}
+
+
+def test_the_report_says_the_same(scene):
+    report, said = (scene / "report.md").read_text(), told(scene)
+    assert said["sanity"]["verdict"].split(" ", 1)[0] in report
+    for check in said["sanity"]["checks"].values():
+        assert check["found"].replace("|", "\\|") in report
+    assert "![" in report
+    assert "honest where at most 10%" in report
+    for choice in said["choices"].values():
+        assert choice in report
+
+
+def test_metres_per_unit_scales_positions(rendered_once, tmp_path):
+    import_scene(rendered_once.folder, tmp_path / "a", metres_per_unit=2.5)
+    poses = np.array([row.pose for row in read_rows(tmp_path / "a")])
+    np.testing.assert_allclose(poses[:, :3], 2.5 * rendered_once.world_from_cam[:, :3, 3], atol=1e-12)
+    assert told(tmp_path / "a")["unit"] == "metre"
+    assert "--metres-per-unit" in told(tmp_path / "a")["choices"]["scale"]
+
+
+def test_a_world_far_away_is_shifted(rendered, tmp_path):
+    def shift(said):
+        for frame in said["frames"]:
+            for axis, by in enumerate((4.5e5, 5.2e6, 0.0)):
+                frame["transform_matrix"][axis][3] += by
+
+    rendered.edit(shift)
+    import_scene(rendered.folder, tmp_path / "a")
+    poses = np.array([row.pose for row in read_rows(tmp_path / "a")])
+    assert np.abs(poses[:, :3]).max() < 5
+    np.testing.assert_allclose(
+        np.diff(poses[:, :3], axis=0), np.diff(rendered.world_from_cam[:, :3, 3], axis=0), atol=1e-8
+    )
+    assert "shifted to [449999.0, 5200000.0" in told(tmp_path / "a")["choices"]["origin"]
+
+
+# --- what captures really look like ----------------------------------------------------------------------------------
+
+
+def test_bad_frames_are_left_out_and_named(rendered, tmp_path):
+    def spoil(said):
+        said["frames"][3]["transform_matrix"][0][3] = math.nan
+        said["frames"].append({**said["frames"][0], "file_path": "images/0041.png"})
+
+    rendered.edit(spoil)
+    cut, small = rendered.folder / "images/0008.png", rendered.folder / "images/0011.png"
+    content = cut.read_bytes()
+    cut.unlink(), cut.write_bytes(content[: len(content) // 2])
+    small.unlink(), cv2.imwrite(str(small), np.zeros((30, 50, 3), np.uint8))
+    imported = import_scene(rendered.folder, tmp_path / "a")
+    assert {Path(file).name: rule for file, rule in imported.left_out.items()} == {
+        "0004.png": "pose has NaN or infinite numbers",
+        "0008.png": "image is truncated",
+        "0011.png": "image is 50x30, its camera's 160x120",
+    }
+    said = told(tmp_path / "a")
+    assert said["frames"]["used"] == 37
+    assert said["frames"]["poses_without_image"] == 1
+    assert said["sanity"]["verdict"].startswith("usable, but 3 of 40 frames are left out")
+    assert "0008.png | image is truncated" in (tmp_path / "a/report.md").read_text()
+
+
+def test_images_of_another_shape_are_not_used(rendered, tmp_path):
+    rendered.edit(
+        lambda said: [said.pop(key) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")]
+    )
+    for number in (5, 6):
+        path = rendered.folder / f"images/{number:04d}.png"
+        path.unlink(), cv2.imwrite(str(path), np.zeros((160, 120, 3), np.uint8))
+    import_scene(rendered.folder, tmp_path / "a")
+    rows = {row.image.name: row.split for row in read_rows(tmp_path / "a")}
+    assert rows["0005.png"] == rows["0006.png"] == "unused"
+    assert "2 images are shaped otherwise" in told(tmp_path / "a")["sanity"]["verdict"]
+
+
+def test_too_few_frames_are_written_as_not_usable_and_refused(rendered, tmp_path, capsys):
+    rendered.edit(lambda said: said.update(frames=said["frames"][:12]))
+    with pytest.raises(SystemExit) as exit_:
+        tool(rendered.folder, "--out", tmp_path / "a")
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert "not usable: 12 usable frames, and 20 are needed" in error
+    assert len(error.splitlines()) == 1
+    assert "**not usable:**" in (tmp_path / "a/report.md").read_text()
+    with pytest.raises(InputError, match="was found not usable: 12 usable frames"):
+        read_split(tmp_path / "a", "train", BadFrames())
+
+
+def test_files_are_copied_where_nothing_is_to_be_done(rendered, tmp_path):
+    rendered.edit(lambda said: said.update(k1=0, k2=0, p1=0, p2=0))
+    import_scene(rendered.folder, tmp_path / "a")
+    for image in (rendered.folder / "images").iterdir():
+        assert (tmp_path / "a/images/images" / image.name).read_bytes() == image.read_bytes()
+    (camera,) = told(tmp_path / "a")["cameras"].values()
+    assert camera["images"] == "as they were: the camera is a pinhole"
+
+
+EXIF_TURNED = (
+    b"Exif\x00\x00II*\x00\x08\x00\x00\x00\x01\x00\x12\x01\x03\x00\x01\x00\x00\x00\x06\x00\x00\x00\x00\x00\x00\x00"
+)
+
+
+@pytest.mark.parametrize("size", [SIZE, SIZE[::-1]], ids=["as stored", "upright"])
+def test_a_photograph_with_exif_is_turned_as_its_camera_has_it(rendered_once, tmp_path, size):
+    """Structure from motion may have seen it either way; the camera's size says which."""
+    capture = selected(read_capture(rendered_once.folder), [0])
+    coarse = np.random.default_rng(1).integers(0, 256, (3, 4, 3), dtype=np.uint8)
+    stored = cv2.resize(coarse, SIZE, interpolation=cv2.INTER_CUBIC)
+    jpeg = cv2.imencode(".jpg", stored[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    segment = b"\xff\xe1" + (len(EXIF_TURNED) + 2).to_bytes(2, "big") + EXIF_TURNED
+    (tmp_path / "a.jpg").write_bytes(jpeg[:2] + segment + jpeg[2:])
+    camera = Camera(*size, (140.0, 140.0), (size[0] / 2, size[1] / 2))
+    capture = replace(capture, images=(tmp_path / "a.jpg",), cameras={"camera-1": camera})
+    written, sizes, rules = write_pictures(capture, tmp_path / "out")
+    assert rules == {}
+    assert sizes == [size]
+    expected = stored if size == SIZE else np.rot90(stored, k=-1)
+    assert np.abs(read_image(written.images[0]).astype(float) - expected).mean() < 3
+
+
+def test_names_are_made_safe_and_unique(rendered_once, tmp_path):
+    capture = selected(read_capture(rendered_once.folder), [0, 1, 2, 3])
+    names = ("../../up", "../../up", "a b/c", "a_b c")
+    capture = replace(capture, sequences=names, images=(capture.images[0], capture.images[0], *capture.images[2:]))
+    written, _, _ = write_pictures(capture, tmp_path / "out")
+    found = [path.relative_to(tmp_path / "out").as_posix() for path in written.images]
+    assert found == [
+        "images/up/0001.png", "images/up/0001-1.png", "images/a_b_c/0003.png", "images/a_b_c-2/0004.png",
+    ]  # fmt: skip
+
+
+def test_a_source_that_breaks_leaves_nothing(rendered, tmp_path, monkeypatch):
+    monkeypatch.setattr("mambaloc.importing.importer.write_frames", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        import_scene(rendered.folder, tmp_path / "out" / "a")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_the_first_format_that_matches_is_taken(rendered_once, monkeypatch):
+    other = Format("anything", lambda source: True, lambda source: "read")
+    monkeypatch.setattr("mambaloc.importing.formats.FORMATS", {"other": other, **FORMATS})
+    assert read_capture(rendered_once.folder) == "read"
+    assert read_capture(rendered_once.folder, "nerfstudio").kind == "nerfstudio"
+
+
+# --- the tool --------------------------------------------------------------------------------------------------------
+
+
+def test_the_tool_says_what_it_found(rendered_once, tmp_path, capsys):
+    tool(rendered_once.folder, "--out", tmp_path / "room", "--metres-per-unit", "1")
+    said = capsys.readouterr().out
+    assert said.startswith(f"{tmp_path / 'room'}: usable")
+    for word in ("frames", "images and poses", "steps", "train/val/test", "block", "chosen:"):
+        assert word in said
+    assert f"--data.scene {tmp_path / 'room'}" in said
+    with (tmp_path / "room/frames.csv").open() as file:
+        assert tuple(next(csv.reader(file))) == COLUMNS
+    assert f"--out {tmp_path / 'room'} --metres-per-unit 1" in told(tmp_path / "room")["imported"]["command"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{tmp}/nothing", "--out", "{tmp}/a"], "there is no such file or folder"),
+        (["{room}", "--out", "{room}"], "is there already, and no scene is overwritten"),
+        (["{room}", "--out", "{tmp}/a", "--format", "tango"], "--format tango: there is none; choose one of"),
+        (["{room}", "--out", "{tmp}/a", "--metres-per-unit", "0"], "--metres-per-unit 0.0: give a number"),
+        (["{room}", "--out", "{tmp}/a", "--metres-per-unit", "nan"], "--metres-per-unit nan: give a number"),
+        (["{room}", "--out", "{tmp}/a", "--split", "given"], "--split given: this capture has no split of its own"),
+        (["{room}", "--out", "{tmp}/a", "--split", "sequence"], "this capture has one sequence; choose one of auto"),
+        (["{room}/images", "--out", "{tmp}/a"], "looks like no format that is known"),
+        (["{room}", "--out", "{tmp}/file/a"], "choose another folder with --out"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(words, message, rendered_once, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as exit_:
+        tool(*(word.format(tmp=tmp_path, room=rendered_once.folder) for word in words))
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "a").exists()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_imported_says_its_unit():
+    fields = dict.fromkeys(("lenses", "split", "findings", "verdict", "proposals", "chosen", "left_out"))
+    for unit, said in (("metre", "m"), ("unknown", "units")):
+        capture = type("Capture", (), {"unit": unit})()
+        assert Imported(capture=capture, **fields).unit == said
