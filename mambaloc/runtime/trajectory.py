@@ -6,15 +6,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from mambaloc.files import whole_file
+from mambaloc.files import whole_file, writing
 
 
 def write_tum(path: Path, time_s: Iterable[float], position_m: Any, quaternion: Any) -> None:
     """Write lines ``timestamp tx ty tz qx qy qz qw``, of arrays or tensors (N, 3) and (N, 4) wxyz, all or none of them.
 
     TUM puts the scalar last, unlike everything else here.
+
+    Raises:
+        InputError: where the file cannot be written.
     """
     rows = zip(time_s, position_m.tolist(), quaternion.tolist(), strict=True)
     lines = [" ".join(f"{n:.9g}" for n in (t, *xyz, qx, qy, qz, qw)) for t, xyz, (qw, qx, qy, qz) in rows]
-    with whole_file(path) as partial:
+    with writing(path), whole_file(path) as partial:
         partial.write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n", encoding="utf-8")
