@@ -20,6 +20,7 @@ _RECORDS = {
     "points3D.bin": (43, False, "<Q", 8),
     "frames.bin": (64, False, "<I", 16),
 }
+_SENSOR, _POSE = 8, 56  # bytes, of a record in rigs.bin
 
 
 def colmap_folder(folder: Path, places: Sequence[str] = COLMAP_FOLDERS) -> Path | None:
@@ -37,11 +38,12 @@ def load_colmap(path: Path) -> Any:
         InputError: without pycolmap, or for a model that is damaged.
     """
     pycolmap = import_pycolmap(path)
-    for name, record in _RECORDS.items():
-        if (path / name).is_file() and not _is_whole((path / name).read_bytes(), *record):
+    for name in ("images.bin", "points3D.bin", "frames.bin", "rigs.bin"):
+        if (path / name).is_file() and not _is_whole(name, (path / name).read_bytes()):
             raise InputError(f"{path / name}: is cut off or counts more than it holds; export the model again")
     try:
         model = pycolmap.Reconstruction(path)
+        [image.name for image in model.images.values()]  # each must be UTF-8
     except Exception as error:  # whatever COLMAP's C++ throws at a damaged file
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         message = f"{path}: is no COLMAP model that pycolmap can read ({reason[0][:200]}); export it again or remove it"
@@ -73,16 +75,30 @@ def is_sound(camera: Any) -> bool:
     return bool(np.isfinite(camera.params).all()) and min(sizes) > 0
 
 
-def _is_whole(data: bytes, fixed: int, is_named: bool, count: str, item: int) -> bool:
-    """Whether the file holds what it counts: COLMAP believes a count, and fills the memory."""
+def _is_whole(name: str, data: bytes) -> bool:
+    """Whether a file holds what it counts: COLMAP believes a count, and fills the memory."""
     try:
         (records,) = struct.unpack_from("<Q", data)
         at = 8
         for _ in range(records):
-            at += fixed
-            at = data.index(b"\0", at) + 1 if is_named else at
-            (items,) = struct.unpack_from(count, data, at)
-            at += struct.calcsize(count) + item * items
-    except (struct.error, ValueError):
+            at = _end_of_rig(data, at) if name == "rigs.bin" else _end_of_record(data, at, *_RECORDS[name])
+    except (struct.error, ValueError, OverflowError):
         return False
     return at <= len(data)
+
+
+def _end_of_record(data: bytes, at: int, fixed: int, is_named: bool, count: str, item: int) -> int:
+    at += fixed
+    at = data.index(b"\0", at) + 1 if is_named else at
+    (items,) = struct.unpack_from(count, data, at)
+    return at + struct.calcsize(count) + item * int(items)
+
+
+def _end_of_rig(data: bytes, at: int) -> int:
+    """The rig's number, how many sensors it has, the first one, and each other with its pose or without."""
+    (sensors,) = struct.unpack_from("<4xI", data, at)
+    at += 8 + _SENSOR * min(1, sensors)
+    for _ in range(1, sensors):
+        (has_pose,) = struct.unpack_from("<?", data, at + _SENSOR)
+        at += _SENSOR + 1 + _POSE * has_pose
+    return at

@@ -3,7 +3,7 @@
 ARKit's camera looks along -z with y up, as OpenGL's does, in metres in a world whose y is up; its principal point is
 counted from the top-left **corner** of the image (Apple, ``ARCamera.transform`` and ``ARCamera.intrinsics``).
 
-Record3D (an unpacked ``.r3d``): ``metadata`` or ``metadata.json`` with ``poses``, a row ``qx qy qz qw tx ty tz`` a frame,
+Record3D (an unpacked ``.r3d``): ``metadata`` or ``metadata.json`` with ``poses``, a row ``qx qy qz qw tx ty tz`` each,
 camera-to-world in OpenGL's axes; ``K``, 3x3 of the first frame column after column; ``w`` and ``h``; perhaps
 ``perFrameIntrinsicCoeffs``, rows ``fx fy cx cy``, and ``frameTimestamps``. Frame N is ``rgbd/N.jpg``. Source: its
 author's answers (github.com/marek-simonik/record3d, issues 27, 36, 63, 64), ``record3d2nerf.py`` of instant-ngp, and
@@ -24,7 +24,7 @@ import numpy as np
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.posed import OPENCV_FROM_OPENGL, Posed, from_quaternions, gathered, pinhole, rigid
+from mambaloc.importing.posed import CORNER_PX, OPENCV_FROM_OPENGL, Posed, from_quaternions, gathered, pinhole, rigid
 from mambaloc.importing.untrusted import (
     array_of,
     first_with_pictures,
@@ -134,7 +134,7 @@ def _record3d_cameras(metadata: dict[str, object], path: Path, count: int) -> li
     else:
         fx, _, _, _, fy, _, cx, cy, _ = array_of(metadata.get("K"), (9,), "K", path)
         rows = np.tile((fx, fy, cx, cy), (count, 1))
-    return [pinhole(size, row[:2], row[2:] - 0.5, path) for row in rows]
+    return [pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path) for fx, fy, cx, cy in rows.tolist()]
 
 
 def _told_apart(cameras: list[Camera]) -> tuple[list[str], dict[str, Camera]]:
@@ -157,7 +157,7 @@ def _polycam_frame(path: Path) -> tuple[np.ndarray, Camera]:
     frame = read_json(path, "a camera of Polycam")
     keys = [f"t_{row}{column}" for row in range(3) for column in range(4)]
     matrix = array_of([frame.get(key) for key in keys], (12,), "t_00 to t_23", path).reshape(1, 3, 4)
-    lens = array_of([frame.get(key) for key in ("fx", "fy", "cx", "cy")], (4,), "fx, fy, cx, cy", path)
+    fx, fy, cx, cy = array_of([frame.get(key) for key in ("fx", "fy", "cx", "cy")], (4,), "fx, fy, cx, cy", path)
     size = array_of([frame.get("width"), frame.get("height")], (2,), "width, height", path).tolist()
     pose = rigid(matrix, lambda _: str(path))[0] @ OPENCV_FROM_OPENGL
-    return pose, pinhole(size, lens[:2], lens[2:] - 0.5, path)
+    return pose, pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path)

@@ -1,9 +1,9 @@
 """COLMAP models, text or binary, with any of its camera models.
 
 The model lies in ``SOURCE/sparse/0``, ``SOURCE/sparse`` or SOURCE itself, its images in ``SOURCE/images`` or beside.
-COLMAP's poses turn the world into the camera, in OpenCV's camera axes and an arbitrary scale, and its pixels are counted
-from the corner of the top-left one, half a pixel more than here. Source: colmap.github.io/format.html and
-colmap.github.io/cameras.html; poses and projections are pycolmap's own.
+COLMAP's poses turn the world into the camera, in OpenCV's camera axes and an arbitrary scale; its pixels are counted
+from the corner of the top-left one, half a pixel more than here. Source: colmap.github.io/format.html and cameras.html
+there; poses and projections are pycolmap's own.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, is_sound, load_colmap
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.posed import Posed, gathered, rigid
+from mambaloc.importing.posed import CORNER_PX, LARGEST_PX, Posed, gathered, rigid
 from mambaloc.importing.untrusted import folder_name, inside, natural, pictures
 
 _PLACES = (*COLMAP_FOLDERS, ".")
-_CORNER_PX = 0.5
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
 
@@ -94,14 +93,14 @@ def _sequence(name: str, source: Path) -> str:
 
 
 def _camera(camera: Any, path: Path) -> Camera:
-    if not is_sound(camera):
+    if not is_sound(camera) or max(camera.width, camera.height) > LARGEST_PX:
         raise InputError(f"{path}: holds a camera without a size or a finite, positive focal length; export it again")
     model = str(camera.model_name)
     return Camera(
         int(camera.width),
         int(camera.height),
         (float(camera.focal_length_x), float(camera.focal_length_y)),
-        (float(camera.principal_point_x) - _CORNER_PX, float(camera.principal_point_y) - _CORNER_PX),
+        (float(camera.principal_point_x) - CORNER_PX, float(camera.principal_point_y) - CORNER_PX),
         None if model in _PINHOLES else _distorted(camera),
         model,
     )
@@ -112,6 +111,6 @@ def _distorted(camera: Any) -> Callable[[NDArray[np.float64]], NDArray[np.float6
 
     def distorted(rays: NDArray[np.float64]) -> NDArray[np.float64]:
         points: NDArray[np.float64] = np.column_stack([rays, np.ones(len(rays))])
-        return camera.img_from_cam(points) - _CORNER_PX  # type: ignore[no-any-return]
+        return camera.img_from_cam(points) - CORNER_PX
 
     return distorted

@@ -1,11 +1,12 @@
 """Tables of poses: columns by their names in the first line, in any order.
 
-``scene,split,seq,img_path,t1,t2,t3,q1,q2,q3,q4`` is TransPoseNet's (Shavit et al. 2021, ``datasets/CameraPoseDataset.py``
-of github.com/yolish/transposenet), ``scene,split,image,x,y,z,qw,qx,qy,qz`` this project's; ``tx,ty,tz`` and a ``time``
-are understood, too. The position is the camera centre. The quaternion is what a dataset's own labels hold: in both
-tables of 7-Scenes camera-to-world, of Cambridge Landmarks **world-to-camera**, and no column says which. So it is taken
-as camera-to-world, unless a row is of a Cambridge scene: then the format must be named, ``csv_world_from_cam`` or
-``csv_cam_from_world``. ``q1`` to ``q4`` are scalar first in TransPoseNet's table, and refused in any other.
+``scene,split,seq,img_path,t1,t2,t3,q1,q2,q3,q4`` is TransPoseNet's (Shavit et al. 2021,
+``datasets/CameraPoseDataset.py`` of github.com/yolish/transposenet), ``scene,split,image,x,y,z,qw,qx,qy,qz`` this
+project's; ``tx,ty,tz`` and a ``time`` are understood, too. The position is the camera centre. The quaternion is what a
+dataset's own labels hold: in both tables of 7-Scenes camera-to-world, of Cambridge Landmarks **world-to-camera**, and
+no column says which. So it is taken as camera-to-world, unless a row is of a Cambridge scene: then the format must be
+named, ``csv_world_from_cam`` or ``csv_cam_from_world``. ``q1`` to ``q4`` are scalar first in TransPoseNet's table, and
+refused in any other.
 """
 
 from __future__ import annotations
@@ -70,7 +71,11 @@ def read_csv(source: Path, direction: Direction | None = None) -> Capture:
     _refuse_cambridge(path, rows, columns, direction)
     numbers = [_numbers(path, line, row, columns) for line, row in rows]
     table = np.array(numbers).reshape(len(rows), 7)
-    world_from_cam, mended = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), _places(path, rows))
+
+    def where(row: int) -> str:
+        return f"{path}, line {rows[row][0]}"
+
+    world_from_cam, mended = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), where)
     folder, images = _images(path, rows, columns)
     posed, missing = [], []
     for (line, row), image, pose in zip(rows, images, world_from_cam, strict=True):
@@ -133,7 +138,9 @@ def _columns(path: Path, names: Sequence[str]) -> _Columns:
         found = [each for each in sets if set(each) <= set(names)]
         if len(found) != 1:
             wanted = " or ".join(",".join(each) for each in sets)
-            raise InputError(f"{path}, line 1: must name the {what} once ({wanted}); it names {','.join(names)[:200]!r}")
+            raise InputError(
+                f"{path}, line 1: must name the {what} once ({wanted}); it names {','.join(names)[:200]!r}"
+            )
         return found[0]
 
     def at_most_one(what: str, known: Sequence[str]) -> str | None:
@@ -162,8 +169,8 @@ def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
     chosen = [(line, row) for line, row in rows if source.is_dir() and row["scene"] == folder_name(source)]
     if not chosen:
         raise InputError(
-            f"{path}: holds the scenes {', '.join(scenes)[:200]}, each with a world of its own; give a table of one, or "
-            f"its folder beside the table with --format, as {path.with_name(scenes[0])!s:.200}"
+            f"{path}: holds the scenes {', '.join(scenes)[:200]}, each with a world of its own; give a table of one, "
+            f"or its folder beside the table with --format, as {path.with_name(scenes[0])!s:.200}"
         )
     return chosen
 
@@ -173,8 +180,8 @@ def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction:
         first = row[columns.image].replace("\\", "/").partition("/")[0]
         if direction is None and any(name in (row.get("scene"), first) for name in _CAMBRIDGE):
             raise InputError(
-                f"{path}, line {line}: is of Cambridge Landmarks, whose labels turn the world into the camera; say with "
-                "--format csv_cam_from_world that these do, too, or with csv_world_from_cam that they do not"
+                f"{path}, line {line}: is of Cambridge Landmarks, whose labels turn the world into the camera; say "
+                "with --format csv_cam_from_world that these do, too, or with csv_world_from_cam that they do not"
             )
 
 

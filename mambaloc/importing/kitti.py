@@ -125,7 +125,9 @@ def _only_sequence(source: Path) -> Path:
 def _camera(calibration: Path, name: str, image: Path) -> tuple[Camera, Matrices]:
     """The camera of an image folder, and its place in camera 0."""
     key = f"P{name.removeprefix('image_')}:"
-    rows = [words[1:] for _, words in read_lines(calibration, "lines 'P0: ' to 'P3: ' of 12 numbers") if words[0] == key]
+    rows = [
+        words[1:] for _, words in read_lines(calibration, "lines 'P0: ' to 'P3: ' of 12 numbers") if words[0] == key
+    ]
     values = as_numbers(rows[0]) if len(rows) == 1 else None
     if values is None or len(values) != 12 or not np.isfinite(values).all():
         raise InputError(f"{calibration}: has no line '{key}' of 12 finite numbers; get it again")

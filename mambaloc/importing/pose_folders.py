@@ -5,8 +5,8 @@ lost, and ``intrinsic/intrinsic_color.txt``, 4x4. Source: ``export_poses`` of Se
 github.com/ScanNet/ScanNet).
 
 Replica: ``results/frameNNNNNN.jpg`` with ``traj.txt``, a 4x4 camera-to-world matrix a line in metres, and
-``cam_params.json`` beside it or one folder up. Source: NICE-SLAM (Zhu et al. 2022), whose loaders turn both formats'
-y and z axes around to come to OpenGL's, so that they are OpenCV's here.
+``cam_params.json`` beside it or one folder up. Source: NICE-SLAM (Zhu et al. 2022), whose loaders turn both formats' y
+and z axes around to come to OpenGL's, so that they are OpenCV's here.
 """
 
 from __future__ import annotations
@@ -55,7 +55,9 @@ def read_scannet(source: Path) -> Capture:
     images = {image.stem: image for image in pictures(folder / "color")}
     files = sorted((folder / "pose").glob("*.txt"), key=natural) if (folder / "pose").is_dir() else []
     if not images or not files:
-        raise InputError(f"{source}: has no images in {folder / 'color'}, or no NAME.txt in {folder / 'pose'}; add them")
+        raise InputError(
+            f"{source}: has no images in {folder / 'color'}, or no NAME.txt in {folder / 'pose'}; add them"
+        )
     matrices = {file: _read_matrix(file) for file in files}
     tracked = [file for file, matrix in matrices.items() if np.isfinite(matrix).all()]
     if not tracked:
@@ -63,7 +65,9 @@ def read_scannet(source: Path) -> Capture:
     world_from_cam = rigid(np.stack([matrices[file] for file in tracked]), lambda row: str(tracked[row]))
     camera = _scannet_camera(folder / "intrinsic" / "intrinsic_color.txt", next(iter(images.values())))
     name = folder_name(source)
-    present = [(images[file.stem], pose) for file, pose in zip(tracked, world_from_cam, strict=True) if file.stem in images]
+    present = [
+        (images[file.stem], pose) for file, pose in zip(tracked, world_from_cam, strict=True) if file.stem in images
+    ]
     return gathered(
         "scannet",
         source,

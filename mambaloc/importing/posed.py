@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +21,15 @@ Matrices = NDArray[np.float64]
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes of OpenGL, ARKit and ARCore (x right, y up, z backwards) in OpenCV's, and the other way."""
 
+CORNER_PX = 0.5
+"""How far the corner of the top-left pixel is from its centre, where pixels are counted from here."""
+
+LARGEST_PX = 100_000
+"""Side of the largest images."""
+
 _FARTHEST = 1e9  # of any unit: more is no position
 _ROTATION_TOLERANCE = 1e-2
 _UNIT_TOLERANCE = 1e-3
-_LARGEST_PX = 100_000
 
 
 @dataclass(frozen=True)
@@ -65,8 +71,8 @@ def gathered(
         InputError: where no image is left, or one is named twice.
     """
     if not posed:
-        example = f", such as {missing[0]!r}" if missing else ""
-        raise InputError(f"{source}: has no image with a pose: {len(missing)} are named and missing{example}; add them")
+        named = f"; {len(missing)} are named and missing, such as {missing[0]!r}" if missing else ""
+        raise InputError(f"{source}: has no image with a pose{named}; add them")
     used: set[Path] = set()
     for each in posed:
         if each.image in used:
@@ -107,7 +113,9 @@ def rigid(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
         InputError: for a row that is no rigid transform.
     """
     tensor = torch.from_numpy(matrices)
-    _refuse(~is_rotation(tensor[:, :3, :3], _ROTATION_TOLERANCE).numpy(), where, "the pose's rotation is not orthonormal")
+    _refuse(
+        ~is_rotation(tensor[:, :3, :3], _ROTATION_TOLERANCE).numpy(), where, "the pose's rotation is not orthonormal"
+    )
     if matrices.shape[1] == 4:
         is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
         _refuse(~is_last, where, "the pose's last row is not 0 0 0 1")
@@ -150,7 +158,7 @@ def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[floa
         InputError: for a size that is none, or numbers that no lens has.
     """
     width, height = size
-    is_size = all(1 <= side <= _LARGEST_PX and side == int(side) for side in size)
+    is_size = all(1 <= side <= LARGEST_PX and side == int(side) for side in size)
     if not is_size or not all(np.isfinite([*focal, *centre])) or min(focal) <= 0:
         raise InputError(f"{where}: a camera must have a size and finite, positive focal lengths; export it again")
     if not (abs(centre[0] - width / 2) <= width / 4 and abs(centre[1] - height / 2) <= height / 4):
@@ -161,6 +169,6 @@ def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[floa
     return Camera(int(width), int(height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
 
 
-def _refuse(is_bad: NDArray[np.bool_], where: Callable[[int], str], rule: str) -> None:
-    if is_bad.any():
+def _refuse(is_bad: Any, where: Callable[[int], str], rule: str) -> None:
+    if np.any(is_bad):
         raise InputError(f"{where(int(np.argmax(is_bad)))}: {rule}; correct or remove it")

@@ -1,8 +1,8 @@
 """Pictures without poses, a film or a folder of photographs: posed by structure from motion (COLMAP, on the CPU).
 
-SIFT features (Lowe 2004), matched between neighbours in a film and between all of a few photographs, incremental mapping
-(Schönberger and Frahm 2016), one camera with a radial distortion for all pictures of one size. The scale is arbitrary.
-What was made is kept in the user's cache and found again, unless the pictures change.
+SIFT features (Lowe 2004), matched between neighbours in a film and between all of a few photographs, incremental
+mapping (Schönberger and Frahm 2016), one camera with a radial distortion for all pictures of one size. The scale is
+arbitrary. What was made is kept in the user's cache and found again, unless the pictures change.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _FEATURES, _LONGEST_PX = 4096, 1600
 _NEIGHBOURS = 10
 _JPEG_QUALITY = 95
 _ADVICE = (
-    "film slowly and sideways rather than turning on the spot, with texture, light and little motion in view, and return "
-    "to where you began"
+    "film slowly and sideways rather than turning on the spot, with texture, light and little motion in view, and "
+    "return to where you began"
 )
 
 
@@ -77,7 +77,12 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
         capture,
         kind="structure_from_motion",
         sequences=(name,) * len(capture.images),
-        choices={**capture.choices, **note["choices"], "direction": "camera-to-world", "model": f"{folder.parent.name}/{folder.name} of the cache"},
+        choices={
+            **capture.choices,
+            **note["choices"],
+            "direction": "camera-to-world",
+            "model": f"{folder.parent.name}/{folder.name} of the cache",
+        },
         time_s=np.array([note["time_s"][image.name] for image in capture.images]) if note["time_s"] else None,
         images_without_pose=tuple(unplaced),
     )
@@ -94,7 +99,13 @@ def _digest(source: Path, seed: int) -> str:
 
 def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
     """Fill a folder with chosen images, the largest model of them, and a note of what was decided."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         frames, total = frames_of(source) if source.is_file() else _of_pictures(source)
         seen = iter(progress.track(frames, total=total, description="Choosing frames"))
@@ -103,7 +114,9 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
         time_s, sizes = _write(choose_frames(seen) if is_film else seen, folder / "images")
         names = _thinned(folder / "images", sorted(time_s))
         if len(names) < _FEWEST_FRAMES:
-            raise InputError(f"{source}: shows {len(names)} frames that differ, of {_FEWEST_FRAMES} at least; {_ADVICE}")
+            raise InputError(
+                f"{source}: shows {len(names)} frames that differ, of {_FEWEST_FRAMES} at least; {_ADVICE}"
+            )
         placed = _place(source, folder, names, len(sizes) == 1, is_film, threads, seed, progress)
     if placed < max(_FEWEST_FRAMES, _LEAST_PLACED * len(names)):
         raise InputError(
@@ -140,14 +153,23 @@ def _write(frames: Iterable[SourceFrame], folder: Path) -> tuple[dict[str, float
 
 def _thinned(folder: Path, names: list[str]) -> list[str]:
     """Keep at most so many frames, evenly."""
-    kept = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, min(_MOST_FRAMES, len(names))).round().astype(int))]
+    kept = [
+        names[i] for i in np.unique(np.linspace(0, len(names) - 1, min(_MOST_FRAMES, len(names))).round().astype(int))
+    ]
     for name in set(names) - set(kept):
         (folder / name).unlink()
     return kept
 
 
 def _place(
-    source: Path, folder: Path, names: list[str], one_camera: bool, is_film: bool, threads: int, seed: int, progress: Progress
+    source: Path,
+    folder: Path,
+    names: list[str],
+    one_camera: bool,
+    is_film: bool,
+    threads: int,
+    seed: int,
+    progress: Progress,
 ) -> int:
     """Reconstruct, and write the largest model to ``sparse/0``; how many images it places."""
     import pycolmap

@@ -87,13 +87,16 @@ def read_tum(source: Path) -> Capture:
     images = pictures(first_with_pictures([found[0].parent / name for name in _IMAGE_FOLDERS]))
     pairs, missing = _by_name(images, table)
     how = "the trajectory's first column names the images"
-    if not pairs:
-        stamps = _stamps(images, table)
+    stamps = _stamps(images)
+    if not pairs and stamps is None:
+        raise InputError(
+            f"{table.path}: does not tell which pose is which image's: {images[0].name!r} is neither a time stamp such "
+            f"as 1305031102.175304.png, nor in its first column; write lines 'timestamp file' to "
+            f"{table.path.with_name('rgb.txt')} and call the trajectory groundtruth.txt"
+        )
+    if not pairs and stamps is not None:
         pairs, how = _by_time(images[0].parent, stamps, table), f"nearest time stamps, within {FARTHEST_S} s"
-    are_stamps = all("." in word for word in table.words)
-    stamps_of = as_numbers([images[i].stem for i, _ in pairs]) if are_stamps else None
-    times = [None] * len(pairs) if stamps_of is None else stamps_of.tolist()
-    rows = [(images[i], j, time_s) for (i, j), time_s in zip(pairs, times, strict=True)]
+    rows = [(images[i], j, None if stamps is None else float(stamps[i])) for i, j in pairs]
     return _capture("tum", found[0].parent, table, rows, how, missing, images)
 
 
@@ -153,20 +156,16 @@ def _by_name(images: Sequence[Path], table: Table) -> tuple[list[tuple[int, int]
 def _plain(name: str) -> str:
     """An image's name without folder, suffix and leading zeros, or a whole number without ``.0``."""
     path = PurePosixPath(name)
-    stem = path.stem if path.suffix.lower() in (*PICTURES, ".0") else path.name
-    return stem.lstrip("0") or "0" if stem.isascii() and stem.isdecimal() else stem
+    stem = path.stem if path.suffix.lower() in PICTURES else path.name
+    whole = stem.removesuffix(".0")
+    return whole.lstrip("0") or "0" if whole.isascii() and whole.isdecimal() else stem
 
 
-def _stamps(images: Sequence[Path], table: Table) -> NDArray[np.float64]:
-    """Seconds that image files are named by; whole numbers could as well count frames."""
+def _stamps(images: Sequence[Path]) -> NDArray[np.float64] | None:
+    """Seconds that image files are named by, if they are; whole numbers could as well count frames."""
     stamps = as_numbers([image.stem for image in images])
-    if stamps is None or not np.isfinite(stamps).all() or not all("." in image.stem for image in images):
-        raise InputError(
-            f"{table.path}: does not tell which pose is which image's: {images[0].name!r} is neither a time stamp such "
-            f"as 1305031102.175304.png, nor in its first column; write lines 'timestamp file' to "
-            f"{table.path.with_name('rgb.txt')} and call the trajectory groundtruth.txt"
-        )
-    return stamps
+    has_fractions = all("." in image.stem for image in images)
+    return stamps if stamps is not None and has_fractions and np.isfinite(stamps).all() else None
 
 
 def _capture(

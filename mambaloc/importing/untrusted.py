@@ -169,7 +169,9 @@ def pictures(folder: Path) -> list[Path]:
     """The pictures in a folder in natural order, without depth; none where there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural)
+    return sorted(
+        (p for p in folder.iterdir() if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural
+    )
 
 
 def first_with_pictures(folders: Sequence[Path]) -> Path:

@@ -12,7 +12,7 @@ from recorded import Recording, record
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
 
-settings.register_profile("thorough", max_examples=10_000)
+settings.register_profile("thorough", max_examples=2_000)
 
 
 @pytest.fixture(scope="session")

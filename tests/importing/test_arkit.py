@@ -18,7 +18,9 @@ WIDTH, HEIGHT = SIZE
 def arkit(world_from_cam):
     """The same cameras in ARKit's axes: half a turn about x."""
     turned = world_from_cam.copy()
-    turned[:, :3, :3] = (Rotation.from_matrix(turned[:, :3, :3]) * Rotation.from_euler("x", 180, degrees=True)).as_matrix()
+    turned[:, :3, :3] = (
+        Rotation.from_matrix(turned[:, :3, :3]) * Rotation.from_euler("x", 180, degrees=True)
+    ).as_matrix()
     return turned
 
 

@@ -7,50 +7,11 @@ import math
 import cv2
 import numpy as np
 import pytest
+from colmap_models import MODELS, NAMES, pycolmap, write_model
 from recorded import FRAMES, SIZE
-from scipy.spatial.transform import Rotation
 
 from mambaloc.importing.colmap import read_colmap
 from mambaloc.importing.formats import read_capture
-
-pycolmap = pytest.importorskip("pycolmap", reason="pycolmap, the extra [colmap], writes the models")
-
-MODELS = {
-    "SIMPLE_PINHOLE": [60.0, 33.0, 25.0],
-    "PINHOLE": [60.0, 61.0, 33.0, 25.0],
-    "SIMPLE_RADIAL": [60.0, 33.0, 25.0, -0.12],
-    "RADIAL": [60.0, 33.0, 25.0, -0.12, 0.03],
-    "OPENCV": [60.0, 61.0, 33.0, 25.0, -0.12, 0.03, 0.002, -0.003],
-    "FULL_OPENCV": [60.0, 61.0, 33.0, 25.0, -0.12, 0.03, 0.002, -0.003, 0.01, 0.1, 0.02, -0.01],
-    "OPENCV_FISHEYE": [60.0, 61.0, 33.0, 25.0, -0.02, 0.01, 0.003, -0.002],
-    "SIMPLE_RADIAL_FISHEYE": [60.0, 33.0, 25.0, -0.02],
-    "RADIAL_FISHEYE": [60.0, 33.0, 25.0, -0.02, 0.01],
-    "FOV": [60.0, 61.0, 33.0, 25.0, 0.8],
-    "THIN_PRISM_FISHEYE": [60.0, 61.0, 33.0, 25.0, -0.02, 0.01, 0.002, -0.003, 0.003, -0.002, 0.001, 0.002],
-}
-NAMES = [f"walk/{k}.jpg" for k in (0, 1, 2)] + [f"run/{k}.jpg" for k in (9, 10, 11)]
-
-
-def write_model(recording, folder, binary=True, models=("SIMPLE_RADIAL",), names=NAMES, points=True):
-    """The recording's cameras, image k taken with model k modulo their number, and an image that was not placed."""
-    model = pycolmap.Reconstruction()
-    for number, name in enumerate(models):
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=number + 1, model=name, width=SIZE[0], height=SIZE[1], params=MODELS[name])
-        )
-    for k, (name, pose) in enumerate(zip(names, recording.world_from_cam, strict=True)):
-        inverse = np.linalg.inv(pose)
-        turn = Rotation.from_matrix(inverse[:3, :3]).as_quat()
-        seen = pycolmap.Point2DList([pycolmap.Point2D(np.array([3.0, 4.0]))])
-        image = pycolmap.Image(name=name, camera_id=1 + k % len(models), image_id=k + 1, points2D=seen)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(turn), inverse[:3, 3]))
-    if points:
-        track = pycolmap.Track()
-        for k in range(2):
-            track.add_element(k + 1, 0)
-        model.add_point3D(np.array([1.0, 2.0, 3.0]), track, np.zeros(3, np.uint8))
-    folder.mkdir(parents=True, exist_ok=True)
-    (model.write_binary if binary else model.write_text)(str(folder))
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -96,7 +57,12 @@ def oracle(model, rays):
     if "FISHEYE" in model:
         k = np.array([*extra, 0, 0, 0][:4]) if model != "OPENCV_FISHEYE" else np.array(extra)
         return cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), matrix, k)[0][0]
-    order = {"SIMPLE_RADIAL": [*extra, 0, 0, 0], "RADIAL": [*extra, 0, 0], "SIMPLE_PINHOLE": [0] * 4, "PINHOLE": [0] * 4}
+    order = {
+        "SIMPLE_RADIAL": [*extra, 0, 0, 0],
+        "RADIAL": [*extra, 0, 0],
+        "SIMPLE_PINHOLE": [0] * 4,
+        "PINHOLE": [0] * 4,
+    }
     k = np.array(order.get(model, extra), dtype=float)
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, k)[0][:, 0]
 

@@ -46,7 +46,13 @@ def folder(recording, tmp_path):
 
 @pytest.mark.parametrize(
     ("columns", "delimiter"),
-    [(OURS, ","), (OURS[::-1], ","), (TRANSPOSENET, ","), (["Image", *OURS[3:]], ";"), (["image", "tx", "ty", "tz", *OURS[6:]], "\t")],
+    [
+        (OURS, ","),
+        (OURS[::-1], ","),
+        (TRANSPOSENET, ","),
+        (["Image", *OURS[3:]], ";"),
+        (["image", "tx", "ty", "tz", *OURS[6:]], "\t"),
+    ],
 )
 def test_columns_come_in_any_order(folder, recording, columns, delimiter):
     (folder / "poses.csv").write_text("\ufeff" + lines(recording, columns, delimiter=delimiter), encoding="utf-8")
@@ -122,7 +128,10 @@ HEADER = "image,x,y,z,qw,qx,qy,qz\n"
         (HEADER + ROW.replace("a.jpg", "/a.jpg"), "line 2: names '/a.jpg', which is no file inside of"),
         (HEADER + ROW.replace("a.jpg", ""), "line 2: names '', which is no file inside of"),
         (HEADER + ROW, "has no image with a pose"),
-        (HEADER.replace("image", "split,image") + "holdout," + ROW, "line 2: split 'holdout' is none of train, val, test"),
+        (
+            HEADER.replace("image", "split,image") + "holdout," + ROW,
+            "line 2: split 'holdout' is none of train, val, test",
+        ),
         (HEADER.replace("image", "time,image") + "noon," + ROW, "line 2: time 'noon' is no number of seconds"),
         (HEADER + ROW * 2, "more than one pose"),
         (HEADER + '"' + "a" * 200_000 + '"\n', "is no CSV (field larger than field limit"),

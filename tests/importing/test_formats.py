@@ -51,7 +51,13 @@ def test_each_format_is_taken_for_itself(tmp_path, kind, files):
 
 @pytest.mark.parametrize(
     ("kind", "name"),
-    [("csv", "a.csv"), ("tum", "a.tum"), ("kitti_poses", "a.kitti"), ("record3d", "a.r3d"), ("structure_from_motion", "a.MP4")],
+    [
+        ("csv", "a.csv"),
+        ("tum", "a.tum"),
+        ("kitti_poses", "a.kitti"),
+        ("record3d", "a.r3d"),
+        ("structure_from_motion", "a.MP4"),
+    ],
 )
 def test_files_are_told_by_their_suffix(tmp_path, kind, name):
     assert detected(make(tmp_path, [name]) / name) == kind

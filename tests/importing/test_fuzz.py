@@ -1,6 +1,6 @@
 """Whatever is in a file, a reader gives a capture or one line: random bytes, damaged files, random JSON.
 
-``pytest tests/importing/test_fuzz.py --hypothesis-profile thorough`` tries a hundred times as much.
+``pytest tests/importing/test_fuzz.py --hypothesis-profile thorough`` tries twenty times as much.
 """
 
 from __future__ import annotations
@@ -66,15 +66,20 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
 }
 TEXT = st.text(st.characters(codec="utf-8"), max_size=60)
 WORDS = st.sampled_from(
-    ["0", "1", "-1", "nan", "inf", "1e999", "1_0", "0x1", "\n", " ", "\t", "#", ",", '"', "\r", "\0", "\u2028", "../x"]
-    + ["/etc/passwd", "C:\\x", "rgb/1.png", "9" * 5000, "a" * 300, "P2:", "P2: ", "\ufeff", "..", ".", "\ud7ff", "1.0"]
+    [
+        *("0", "1", "-1", "nan", "inf", "1e999", "1_0", "0x1", "9" * 5000, "1.0"),
+        *("\n", " ", "\t", "#", ",", '"', "\r", "\0", "\u2028", "\ufeff", "\ud7ff"),
+        *("../x", "/etc/passwd", "C:\\x", "rgb/1.png", "a" * 300, "P2:", "P2: ", "..", "."),
+    ]
 ).map(str.encode)
 NUMBER = st.one_of(
     st.integers(-3, 3), st.floats(), st.just(10**400), st.none(), st.booleans(), TEXT, st.just("\ud800"), st.just(0.5)
 )
 KEYS = st.sampled_from(sorted({*METADATA, *KEYFRAME, "camera", "perFrameIntrinsicCoeffs", "frameTimestamps", "x"}))
 JSON = st.recursive(
-    NUMBER, lambda inner: st.one_of(st.lists(inner, max_size=9), st.dictionaries(KEYS, inner, max_size=9)), max_leaves=20
+    NUMBER,
+    lambda inner: st.one_of(st.lists(inner, max_size=9), st.dictionaries(KEYS, inner, max_size=9)),
+    max_leaves=20,
 )
 KEPT = settings(deadline=None, suppress_health_check=list(HealthCheck))
 
@@ -98,17 +103,22 @@ def reads_or_refuses(kind: str, changed: dict[str, bytes]) -> None:
         for name, content in {**files, **changed}.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-        try:
-            capture = read_capture(folder, kind)
-        except InputError as error:
-            assert "\n" not in str(error)
-            str(error).encode()  # can be printed
-        else:
-            assert np.isfinite(capture.world_from_cam).all()
-            assert all(image.is_file() and image.is_relative_to(folder) for image in capture.images)
-            assert capture.time_s is None or np.isfinite(capture.time_s).all()
+        check_reading(kind, folder)
     finally:
         shutil.rmtree(folder)
+
+
+def check_reading(kind: str, folder: Path) -> None:
+    try:
+        capture = read_capture(folder, kind)
+    except InputError as error:
+        message = str(error).encode().decode()  # it can be printed
+    else:
+        message = ""
+        assert np.isfinite(capture.world_from_cam).all()
+        assert all(image.is_file() and image.is_relative_to(folder) for image in capture.images)
+        assert capture.time_s is None or np.isfinite(capture.time_s).all()
+    assert "\n" not in message
 
 
 @pytest.mark.parametrize("kind", SOURCES)
@@ -130,14 +140,44 @@ def test_damaged_files(kind, file, data):
 
 
 @pytest.mark.parametrize(
-    ("kind", "file"), [("record3d", "metadata"), ("polycam", "keyframes/cameras/1.json"), ("replica", "cam_params.json")]
+    ("kind", "file"),
+    [("record3d", "metadata"), ("polycam", "keyframes/cameras/1.json"), ("replica", "cam_params.json")],
 )
 @KEPT
 @given(data=st.data())
 def test_random_json(kind, file, data):
     whole = json.loads(SOURCES[kind][0][file])
-    change = data.draw(st.one_of(JSON, st.dictionaries(KEYS, JSON, min_size=1, max_size=3).map(lambda part: {**whole, **part})))
+    change = data.draw(
+        st.one_of(JSON, st.dictionaries(KEYS, JSON, min_size=1, max_size=3).map(lambda part: {**whole, **part}))
+    )
     reads_or_refuses(kind, {file: json.dumps(change).encode()})
+
+
+@pytest.fixture(scope="module")
+def colmap(recording, tmp_path_factory):
+    """A whole model, binary or text, with its images; and what is in its files."""
+    models = pytest.importorskip("colmap_models")
+    folders = {}
+    for binary in (True, False):
+        folder = tmp_path_factory.mktemp("colmap")
+        models.write_model(recording, folder, binary, models=("SIMPLE_RADIAL", "OPENCV"))
+        recording.write(folder, models.NAMES)
+        folders[binary] = folder, {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    return folders
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "frames", "rigs", "points3D"])
+@pytest.mark.parametrize("binary", [True, False])
+@KEPT
+@given(data=st.data())
+def test_damaged_colmap_models(colmap, binary, file, data):
+    folder, whole = colmap[binary]
+    name = f"{file}.{'bin' if binary else 'txt'}"
+    try:
+        (folder / name).write_bytes(data.draw(st.one_of(damaged(whole[name]), st.binary(max_size=200))))
+        check_reading("colmap", folder)
+    finally:
+        (folder / name).write_bytes(whole[name])
 
 
 def test_no_text_format_is_left_out():

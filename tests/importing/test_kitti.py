@@ -51,7 +51,9 @@ def test_a_sequence_is_read_back(kitti, recording, place):
     assert set(capture.camera_of) == {"image_2"}
     camera = capture.cameras["image_2"]
     assert (camera.width, camera.height, camera.distorted) == (*SIZE, None)
-    np.testing.assert_allclose((*camera.focal_px, *camera.centre_px), default_intrinsics(SIZE)[[0, 1, 0, 1], [0, 1, 2, 2]])
+    np.testing.assert_allclose(
+        (*camera.focal_px, *camera.centre_px), default_intrinsics(SIZE)[[0, 1, 0, 1], [0, 1, 2, 2]]
+    )
 
 
 def test_a_world_point_falls_where_the_calibration_projects_it(kitti):
@@ -61,7 +63,9 @@ def test_a_world_point_falls_where_the_calibration_projects_it(kitti):
     words = (kitti / "sequences/07/calib.txt").read_text().splitlines()[2].split()[1:]
     projection = np.array(words, dtype=float).reshape(3, 4)
     camera = capture.cameras["image_2"]
-    matrix = np.array([[camera.focal_px[0], 0, camera.centre_px[0]], [0, camera.focal_px[1], camera.centre_px[1]], [0, 0, 1]])
+    matrix = np.array(
+        [[camera.focal_px[0], 0, camera.centre_px[0]], [0, camera.focal_px[1], camera.centre_px[1]], [0, 0, 1]]
+    )
     for pose0, pose in zip(world_from_cam0, capture.world_from_cam, strict=True):
         point_cam0 = np.array([0.3, -0.2, 2.0])
         world = pose0[:, :3] @ point_cam0 + pose0[:, 3]
@@ -114,7 +118,11 @@ def test_several_sequences_are_several_worlds(kitti, refused):
         ("sequences/07/calib.txt", "P0: 1 2 3\n", "calib.txt: has no line 'P2:' of 12 finite numbers"),
         ("sequences/07/calib.txt", "P2: 1 2 3\n", "calib.txt: has no line 'P2:' of 12 finite numbers"),
         ("sequences/07/calib.txt", f"P2: {'1 ' * 12}\n", "is no projection K [I | t]"),
-        ("sequences/07/calib.txt", "P2: 9 0 600 0 0 9 24 0 0 0 1 0\n", "principal point 600, 24 is far from the centre"),
+        (
+            "sequences/07/calib.txt",
+            "P2: 9 0 600 0 0 9 24 0 0 0 1 0\n",
+            "principal point 600, 24 is far from the centre",
+        ),
         ("sequences/07/calib.txt", "P2: inf 0 32 0 0 9 24 0 0 0 1 0\n", "has no line 'P2:' of 12 finite numbers"),
         ("sequences/07/times.txt", "0\n1\n", "times.txt: has 2 times for 6 poses"),
         ("sequences/07/times.txt", "0\n1 2\n", "times.txt, line 2: is no line 'seconds'"),

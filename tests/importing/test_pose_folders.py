@@ -47,7 +47,9 @@ def test_a_scannet_recording_is_read_back(scannet, recording, place, tmp_path_fa
     assert [path.read_bytes() for path in capture.images] == recording.jpegs  # 0, 5, 10, ..., not 0, 10, 15
     camera = capture.cameras["color"]
     assert (camera.width, camera.height) == SIZE
-    np.testing.assert_allclose((*camera.focal_px, *camera.centre_px), default_intrinsics(SIZE)[[0, 1, 0, 1], [0, 1, 2, 2]])
+    np.testing.assert_allclose(
+        (*camera.focal_px, *camera.centre_px), default_intrinsics(SIZE)[[0, 1, 0, 1], [0, 1, 2, 2]]
+    )
 
 
 def test_lost_poses_are_left_out_and_counted(scannet, recording):
@@ -138,7 +140,11 @@ def test_replica_frames_are_found_by_their_number(replica, recording):
         ("traj.txt", "1 0 0\n", "traj.txt, line 1: is no line"),
         ("traj.txt", "", "traj.txt: is empty"),
         ("traj.txt", "1 0 0 0 0 1 0 0 0 0 1 inf 0 0 0 1\n", "traj.txt, line 1: is no line"),
-        ("traj.txt", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n1 0 0 0 0 3 0 0 0 0 1 0 0 0 0 1\n", "traj.txt, line 2: the pose's"),
+        (
+            "traj.txt",
+            "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n1 0 0 0 0 3 0 0 0 0 1 0 0 0 0 1\n",
+            "traj.txt, line 2: the pose's",
+        ),
         ("../cam_params.json", "{", "cam_params.json: is no whole JSON object"),
         ("../cam_params.json", "[1]", "cam_params.json: is no whole JSON object"),
         ("../cam_params.json", "{}", "'camera: w h fx fy cx cy' must be 6 finite numbers"),

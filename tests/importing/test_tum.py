@@ -100,7 +100,9 @@ def test_a_trajectory_that_names_its_images(recording, tmp_path, names):
 def test_a_trajectory_beside_images_named_by_time(recording, tmp_path):
     stamps = [f"{START_S + k / 10:.6f}" for k in range(len(recording.jpegs))]
     recording.write(tmp_path / "rgb", [f"{stamp}.jpg" for stamp in stamps])
-    (tmp_path / "trajectory.txt").write_text(trajectory(recording, [f"{float(s) - 0.01:.4f}" for s in stamps[:-1]] + ["9"]))
+    (tmp_path / "trajectory.txt").write_text(
+        trajectory(recording, [f"{float(s) - 0.01:.4f}" for s in stamps[:-1]] + ["9"])
+    )
     capture = read_capture(tmp_path)
     np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam[:-1], atol=1e-8)
     np.testing.assert_allclose(capture.time_s, [float(s) for s in stamps[:-1]], atol=1e-6)
