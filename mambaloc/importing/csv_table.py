@@ -2,11 +2,11 @@
 
 ``scene,split,seq,img_path,t1,t2,t3,q1,q2,q3,q4`` is TransPoseNet's (Shavit et al. 2021,
 ``datasets/CameraPoseDataset.py`` of github.com/yolish/transposenet), ``scene,split,image,x,y,z,qw,qx,qy,qz`` this
-project's; ``tx,ty,tz`` and a ``time`` are understood, too. The position is the camera centre. The quaternion is what a
-dataset's own labels hold: in both tables of 7-Scenes camera-to-world, of Cambridge Landmarks **world-to-camera**, and
-no column says which. So it is taken as camera-to-world, unless a row is of a Cambridge scene: then the format must be
-named, ``csv_world_from_cam`` or ``csv_cam_from_world``. ``q1`` to ``q4`` are scalar first in TransPoseNet's table, and
-refused in any other.
+project's; ``tx,ty,tz`` and a ``time`` are understood, too. The position is the camera centre, in metres in these two
+and an unknown unit in any other. The quaternion is what a dataset's own labels hold: in both tables of 7-Scenes
+camera-to-world, of Cambridge Landmarks **world-to-camera**, and no column says which. So it is taken as
+camera-to-world, unless a row is of a Cambridge scene: then the format must be named, ``csv_world_from_cam`` or
+``csv_cam_from_world``. ``q1`` to ``q4`` are scalar first in TransPoseNet's table, and refused in any other.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.importing.capture import Capture
+from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.posed import Posed, from_quaternions, gathered
 from mambaloc.importing.untrusted import as_numbers, folder_name, inside, pictures, read_text
 
@@ -86,17 +86,19 @@ def read_csv(source: Path, direction: Direction | None = None) -> Capture:
             posed.append(Posed(image, name, pose, time_s=time_s, split=_split(path, line, row)))
         else:
             missing.append(row[columns.image])
+    is_known = columns.position == _POSITIONS[2] or (columns.position == _POSITIONS[0] and "scene" in rows[0][1])
     choices = {
         "axes": "OpenCV camera axes, as the datasets have them",
         "direction": "world-to-camera, as --format says" if direction == "cam_from_world" else "camera-to-world",
-        "scale": "metres, as the datasets have them",
+        "scale": "metres, as the datasets have them" if is_known else "unknown: the table does not tell",
         "origin": "kept",
     }
     if mended:
         choices["quaternions"] = f"{mended} of {len(rows)} were not of unit length, and made so"
     beside = [image for parent in dict.fromkeys(each.image.parent for each in posed) for image in pictures(parent)]
     kind = "csv" if direction is None else f"csv_{direction}"
-    return gathered(kind, path, posed, unit="metre", choices=choices, missing=missing, beside=beside)
+    unit: Unit = "metre" if is_known else "unknown"
+    return gathered(kind, path, posed, unit=unit, choices=choices, missing=missing, beside=beside)
 
 
 def _table(source: Path) -> Path:

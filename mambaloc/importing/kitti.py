@@ -39,7 +39,8 @@ _CHOICES = {
 
 def is_kitti(source: Path) -> bool:
     """Whether a folder is KITTI's, or one of its sequences."""
-    return ((source / "poses").is_dir() and (source / "sequences").is_dir()) or _poses_file(source).is_file()
+    is_root = (source / "poses").is_dir() and (source / "sequences").is_dir()
+    return is_root or (source.resolve().parent.name == "sequences" and _poses_file(source).is_file())
 
 
 def read_kitti(source: Path) -> Capture:
