@@ -33,6 +33,9 @@ def find_features(database: Path, images: Path, names: Sequence[str], one_camera
     mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.PER_IMAGE
     options = pycolmap.FeatureExtractionOptions(num_threads=threads, max_image_size=_LONGEST_PX, use_gpu=False)
     options.sift.max_num_features = _FEATURES
+    with pycolmap.Database.open(database):  # which makes it
+        pass
+    pycolmap.import_images(database, images, mode, names)  # else threads would number them as they come
     pycolmap.extract_features(database, images, names, mode, extraction_options=options)
 
 

@@ -57,7 +57,7 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
 
     Args:
         source: a film, or a folder of pictures.
-        threads: that finding and matching features take; -1 for all.
+        threads: that finding and matching features take; -1 for all. What is found does not depend on it.
         seed: of RANSAC.
 
     Raises:
