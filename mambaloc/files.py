@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from mambaloc.errors import InputError
+
+_MOST_JSON_BYTES = 2**30
+_LONGEST_PATH = 1024  # bytes; 255 for each part, as file systems have it
 
 
 def sha256(path: Path) -> str:
@@ -38,6 +42,29 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); {broken}") from None
+
+
+def read_json(path: Path, missing: str, broken: str) -> Any:
+    """Read plain data from a JSON file of at most 1 GiB; the arguments and errors are those of :func:`read_yaml`."""
+    try:
+        if path.stat().st_size > _MOST_JSON_BYTES:
+            raise InputError(f"{path}: is larger than {_MOST_JSON_BYTES} bytes; {broken}")
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError, and so is a number too long
+        raise InputError(f"{path}: is no JSON ({str(error).splitlines()[0]}); {broken}") from None
+
+
+def path_inside(folder: Path, name: str) -> Path | None:
+    """The path that a name in somebody's file means, below a folder; None where it leads out, or no file has it."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    try:
+        is_short = len(name.encode()) <= _LONGEST_PATH and all(len(part.encode()) <= 255 for part in path.parts)
+    except UnicodeEncodeError:  # half a surrogate pair, as JSON may hold
+        return None
+    leaves = path.is_absolute() or ".." in path.parts or PureWindowsPath(name).drive
+    return None if leaves or not path.parts or not is_short or "\0" in name else folder / path
 
 
 @contextmanager

@@ -4,11 +4,12 @@ import subprocess
 import sys
 import threading
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import path_inside, read_json, whole_folder
 from mambaloc.user_cache import made_once
 
 
@@ -80,3 +81,51 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch):
     monkeypatch.setenv("MAMBALOC_CACHE", str(tmp_path / "file"))
     with pytest.raises(InputError, match="set MAMBALOC_CACHE"):
         made_once("kind/a", lambda partial: None)
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("images/a.png", "images/a.png"),
+        ("./images/a b.png", "images/a b.png"),
+        ("images\\a.png", "images/a.png"),
+        ("..a/b..png", "..a/b..png"),
+        ("../a.png", None),
+        ("images/../../a.png", None),
+        ("images\\..\\a.png", None),
+        ("/a.png", None),
+        ("\\a.png", None),
+        ("C:\\a.png", None),
+        ("C:a.png", None),
+        (".", None),
+        ("", None),
+        ("a\0.png", None),
+        ("a" * 256, None),
+        ("a/" * 600, None),
+        ("\ud800.png", None),
+    ],
+)
+def test_a_name_in_a_file_stays_inside_of_the_folder(name, found):
+    assert path_inside(Path("f"), name) == (Path("f", found) if found else None)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(None, "cannot be read .*; add it"), (b"{", "is no JSON .*; mend it"), (b"\xff\xfe", "is no JSON .*; mend it"),
+     (b"9" * 5000, "is no JSON .*; mend it"), (b"[" * 100_000, "is no JSON .*; mend it")],
+)  # fmt: skip
+def test_what_is_no_json(content, message, tmp_path):
+    path = tmp_path / "a.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_json(path, "add it", "mend it")
+    assert "\n" not in str(caught.value)
+
+
+def test_json_that_is_too_large(tmp_path, monkeypatch):
+    (tmp_path / "a.json").write_text("[1, 2, 3]")
+    assert read_json(tmp_path / "a.json", "add it", "mend it") == [1, 2, 3]
+    monkeypatch.setattr("mambaloc.files._MOST_JSON_BYTES", 5)
+    with pytest.raises(InputError, match="larger than 5 bytes; mend it"):
+        read_json(tmp_path / "a.json", "add it", "mend it")

@@ -32,7 +32,7 @@ from mambaloc.importing.untrusted import (
     natural,
     number_of,
     pictures,
-    read_json,
+    read_object,
 )
 
 _CHOICES = {
@@ -58,7 +58,7 @@ def read_record3d(source: Path) -> Capture:
     if source.is_file():
         raise InputError(f"{source}: is an archive; unpack it (unzip {source.name} -d FOLDER) and give the folder")
     path = _metadata(source)
-    metadata = read_json(path, "poses, K, w and h of a Record3D recording")
+    metadata = read_object(path, "poses, K, w and h of a Record3D recording")
     rows = array_of(metadata.get("poses"), (None, 7), "poses", path)
     if len(rows) > 1 and not np.ptp(rows, axis=0).any():
         raise InputError(f"{path}: all {len(rows)} poses are the same; record with the LiDAR camera, which is tracked")
@@ -154,7 +154,7 @@ def _polycam_folders(source: Path) -> tuple[Path, Path] | None:
 
 
 def _polycam_frame(path: Path) -> tuple[np.ndarray, Camera]:
-    frame = read_json(path, "a camera of Polycam")
+    frame = read_object(path, "a camera of Polycam")
     keys = [f"t_{row}{column}" for row in range(3) for column in range(4)]
     matrix = array_of([frame.get(key) for key in keys], (12,), "t_00 to t_23", path).reshape(1, 3, 4)
     fx, fy, cx, cy = array_of([frame.get(key) for key in ("fx", "fy", "cx", "cy")], (4,), "fx, fy, cx, cy", path)

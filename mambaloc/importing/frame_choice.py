@@ -19,7 +19,7 @@ from mambaloc.runtime.sources import SourceFrame
 
 Grey = NDArray[np.uint8]
 
-NEAR, FAR = 0.05, 0.10
+NEAR, FAR = 0.025, 0.05
 """A frame may be chosen once points have moved by ``NEAR`` of its width, and one is before they have by ``FAR``."""
 
 _SIDE_PX = 240  # frames are compared at this size: what a hand's shake blurs, shows

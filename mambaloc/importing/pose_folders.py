@@ -26,7 +26,7 @@ from mambaloc.importing.untrusted import (
     natural,
     number_of,
     pictures,
-    read_json,
+    read_object,
     read_table,
     read_text,
 )
@@ -135,7 +135,7 @@ def _scannet_camera(path: Path, image: Path) -> Camera | None:
 def _replica_camera(source: Path) -> Camera | None:
     for path in (source / "cam_params.json", source.resolve().parent / "cam_params.json"):
         if path.is_file():
-            lens = read_json(path, "the camera").get("camera")
+            lens = read_object(path, "the camera").get("camera")
             keys = ("w", "h", "fx", "fy", "cx", "cy")
             values = [lens.get(key) for key in keys] if isinstance(lens, dict) else None
             w, h, fx, fy, cx, cy = array_of(values, (6,), "camera: w h fx fy cx cy", path).tolist()

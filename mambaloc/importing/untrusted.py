@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.files import path_inside, read_json
 from mambaloc.images import PICTURES
 
 _MOST_BYTES = 1 << 26  # of a text: poses of a million images
-_LONGEST_NAME = 1024  # bytes, of a path; 255 of each of its parts, as file systems have it
 
 
 @dataclass(frozen=True)
@@ -98,18 +97,15 @@ def as_numbers(words: Sequence[str]) -> NDArray[np.float64] | None:
         return None
 
 
-def read_json(path: Path, holds: str) -> dict[str, Any]:
+def read_object(path: Path, holds: str) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
         InputError: where it cannot be read, or is none.
     """
-    try:
-        value = json.loads(read_text(path, holds))
-    except (ValueError, RecursionError):
-        value = None
+    value = read_json(path, f"it holds {holds}", f"it holds {holds}, export it again")
     if not isinstance(value, dict):
-        raise InputError(f"{path}: is no whole JSON object; it holds {holds}, export it again")
+        raise InputError(f"{path}: is no JSON object; it holds {holds}, export it again")
     return value
 
 
@@ -147,16 +143,10 @@ def inside(folder: Path, name: str, where: str) -> Path:
     Raises:
         InputError: for a name that leads out of the folder, or is none that a file can have.
     """
-    plain = name.replace("\\", "/")
-    parts = PurePosixPath(plain).parts
-    try:
-        fits = len(plain.encode()) <= _LONGEST_NAME and all(len(part.encode()) <= 255 for part in parts)
-    except UnicodeEncodeError:  # half a surrogate pair, from JSON
-        fits = False
-    leaves = plain.startswith("/") or ".." in parts or bool(PureWindowsPath(name).drive)
-    if leaves or not parts or not fits or "\0" in plain:
+    path = path_inside(folder, name)
+    if path is None:
         raise InputError(f"{where}: names {name[:60]!r}, which is no file inside of {folder}; correct the name")
-    return folder.joinpath(*parts)
+    return path
 
 
 def natural(path: Path) -> tuple[tuple[int, str, int], ...]:
