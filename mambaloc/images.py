@@ -16,6 +16,9 @@ from mambaloc.errors import InputError
 Image = NDArray[np.uint8]
 """RGB, (H, W, 3)."""
 
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+"""Suffixes of files that are taken for images."""
+
 END_BYTES = 4096
 """How far from a file's end its format's last marker may lie."""
 

@@ -9,9 +9,7 @@ from pathlib import Path
 import cv2
 
 from mambaloc.errors import InputError
-from mambaloc.images import Image, read_image
-
-_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+from mambaloc.images import PICTURES, Image, read_image
 
 
 @dataclass(frozen=True)
@@ -42,13 +40,13 @@ def frames_of(source: str | Path) -> tuple[Iterator[SourceFrame], int | None]:
         return _of_capture(_opened(int(str(source)), f"camera {source}")), None
     path = Path(source)
     if path.is_dir():
-        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in _PICTURES and ".depth." not in p.name)
+        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES and ".depth." not in p.name)
         if not pictures:
-            raise InputError(f"{path}: holds no picture ({', '.join(_PICTURES)}); give a folder of them or a video")
+            raise InputError(f"{path}: holds no picture ({', '.join(PICTURES)}); give a folder of them or a video")
         return _of_pictures(pictures), len(pictures)
     if not path.is_file():
         raise InputError(f"{path}: no such file, folder or camera; a camera is a number, as 0")
-    if path.suffix.lower() in _PICTURES:
+    if path.suffix.lower() in PICTURES:
         return _of_pictures([path]), 1
     capture = _opened(str(path), str(path))
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))

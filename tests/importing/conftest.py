@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from captures import FLIP, FOCAL_PX, LENS, SIZE, Rendered
+from hypothesis import settings
+from recorded import Recording, record
 
 from mambaloc.data.rendering import Room, embedded_room, embedded_walk, render
+from mambaloc.errors import InputError
+from mambaloc.importing.capture import Capture
+
+settings.register_profile("thorough", max_examples=2_000)
 
 
 @pytest.fixture(scope="session")
@@ -57,3 +65,24 @@ def rendered(rendered_once, tmp_path) -> Rendered:
     for image in (rendered_once.folder / "images").iterdir():
         (folder / "images" / image.name).symlink_to(image)
     return Rendered(folder, rendered_once.world_from_cam, rendered_once.matrix, rendered_once.coefficients)
+
+
+@pytest.fixture(scope="session")
+def recording() -> Recording:
+    return record()
+
+
+@pytest.fixture
+def refused() -> Callable[..., str]:
+    """Check that reading ends in one line that says all of some words; return it."""
+
+    def refused(read: Callable[[Path], Capture], source: Path, *says: str) -> str:
+        with pytest.raises(InputError) as caught:
+            read(source)
+        message = str(caught.value)
+        assert "\n" not in message
+        for words in says:
+            assert words in message, message
+        return message
+
+    return refused

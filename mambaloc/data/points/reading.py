@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder
 from mambaloc.data.frames import Frames
-from mambaloc.data.points.colmap import COLMAP_FOLDERS, colmap_folder, read_colmap_points
+from mambaloc.data.points.colmap import read_colmap_points
 from mambaloc.data.points.depth import depth_path, depth_rows, read_depth_points
 from mambaloc.data.points.nvm import NVM_FILE, read_nvm_points
 from mambaloc.data.points.scene_points import ScenePoints

@@ -1,0 +1,104 @@
+"""COLMAP models, text or binary, loaded by pycolmap once their files hold what they count."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mambaloc.errors import InputError
+
+COLMAP_FOLDERS = ("sparse/0", "sparse")
+"""Where a scene's model lies, in the order it is looked for."""
+
+# A record of a binary file: so many bytes, a name that ends in 0 or none, a count, and so many bytes an item.
+_RECORDS = {
+    "images.bin": (64, True, "<Q", 24),
+    "points3D.bin": (43, False, "<Q", 8),
+    "frames.bin": (64, False, "<I", 16),
+}
+_SENSOR, _POSE = 8, 56  # bytes, of a record in rigs.bin
+
+
+def colmap_folder(folder: Path, places: Sequence[str] = COLMAP_FOLDERS) -> Path | None:
+    """The folder of a scene's COLMAP model, if it has one."""
+    for model in (folder / place for place in places):
+        if any((model / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return model
+    return None
+
+
+def load_colmap(path: Path) -> Any:
+    """Load a model's folder as a ``pycolmap.Reconstruction``.
+
+    Raises:
+        InputError: without pycolmap, or for a model that is damaged.
+    """
+    pycolmap = import_pycolmap(path)
+    for name in ("images.bin", "points3D.bin", "frames.bin", "rigs.bin"):
+        if (path / name).is_file() and not _is_whole(name, (path / name).read_bytes()):
+            raise InputError(f"{path / name}: is cut off or counts more than it holds; export the model again")
+    try:
+        model = pycolmap.Reconstruction(path)
+        [image.name for image in model.images.values()]  # each must be UTF-8
+    except Exception as error:  # whatever COLMAP's C++ throws at a damaged file
+        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
+        message = f"{path}: is no COLMAP model that pycolmap can read ({reason[0][:200]}); export it again or remove it"
+        raise InputError(message) from None
+    cameras, read = path / "cameras.bin", 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+    if cameras.is_file() and cameras.stat().st_size < read:  # COLMAP fills up what is missing
+        raise InputError(f"{cameras}: is cut off or counts more than it holds; export the model again")
+    return model
+
+
+def import_pycolmap(needed_by: Path) -> Any:
+    """The module pycolmap.
+
+    Raises:
+        InputError: where it is not installed.
+    """
+    try:
+        import pycolmap
+    except ImportError:
+        raise InputError(
+            f"{needed_by}: is read by pycolmap, which is missing; pip install 'mambaloc[colmap]'"
+        ) from None
+    return pycolmap
+
+
+def is_sound(camera: Any) -> bool:
+    """Whether a ``pycolmap.Camera`` has a size and finite, positive focal lengths."""
+    sizes = (camera.width, camera.height, camera.focal_length_x, camera.focal_length_y)
+    return bool(np.isfinite(camera.params).all()) and min(sizes) > 0
+
+
+def _is_whole(name: str, data: bytes) -> bool:
+    """Whether a file holds what it counts: COLMAP believes a count, and fills the memory."""
+    try:
+        (records,) = struct.unpack_from("<Q", data)
+        at = 8
+        for _ in range(records):
+            at = _end_of_rig(data, at) if name == "rigs.bin" else _end_of_record(data, at, *_RECORDS[name])
+    except (struct.error, ValueError, OverflowError):
+        return False
+    return at <= len(data)
+
+
+def _end_of_record(data: bytes, at: int, fixed: int, is_named: bool, count: str, item: int) -> int:
+    at += fixed
+    at = data.index(b"\0", at) + 1 if is_named else at
+    (items,) = struct.unpack_from(count, data, at)
+    return at + struct.calcsize(count) + item * int(items)
+
+
+def _end_of_rig(data: bytes, at: int) -> int:
+    """The rig's number, how many sensors it has, the first one, and each other with its pose or without."""
+    (sensors,) = struct.unpack_from("<4xI", data, at)
+    at += 8 + _SENSOR * min(1, sensors)
+    for _ in range(1, sensors):
+        (has_pose,) = struct.unpack_from("<?", data, at + _SENSOR)
+        at += _SENSOR + 1 + _POSE * has_pose
+    return at

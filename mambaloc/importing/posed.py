@@ -1,0 +1,174 @@
+"""From what a format says of its images to a capture: poses checked and made exactly rigid, images told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.geometry import is_rotation, matrix_from_pose, normalize, pose_from_matrix
+from mambaloc.importing.capture import Camera, Capture, Unit
+from mambaloc.types import Pose
+
+Matrices = NDArray[np.float64]
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes of OpenGL, ARKit and ARCore (x right, y up, z backwards) in OpenCV's, and the other way."""
+
+CORNER_PX = 0.5
+"""How far the corner of the top-left pixel is from its centre, where pixels are counted from here."""
+
+LARGEST_PX = 100_000
+"""Side of the largest images."""
+
+_FARTHEST = 1e9  # of any unit: more is no position
+_ROTATION_TOLERANCE = 1e-2
+_UNIT_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Posed:
+    """One image and what a format says of it; the fields are those of :class:`Capture`."""
+
+    image: Path
+    sequence: str
+    world_from_cam: Matrices
+    camera: str | None = None
+    time_s: float | None = None
+    split: str | None = None
+
+
+def gathered(
+    kind: str,
+    source: Path,
+    posed: Sequence[Posed],
+    *,
+    unit: Unit,
+    choices: Mapping[str, str],
+    cameras: Mapping[str, Camera] | None = None,
+    missing: Sequence[str] = (),
+    beside: Iterable[Path] = (),
+) -> Capture:
+    """Make a capture: sequence after sequence, in the order of their first images.
+
+    Args:
+        kind: the format.
+        source: for messages.
+        posed: images, all there, each sequence in order.
+        unit: of positions.
+        choices: what was decided, by name.
+        cameras: by name.
+        missing: images that the format names and that are not there.
+        beside: images that are there, of which some may be among ``posed``.
+
+    Raises:
+        InputError: where no image is left, or one is named twice.
+    """
+    if not posed:
+        named = f"; {len(missing)} are named and missing, such as {missing[0]!r}" if missing else ""
+        raise InputError(f"{source}: has no image with a pose{named}; add them")
+    used: set[Path] = set()
+    for each in posed:
+        if each.image in used:
+            raise InputError(f"{source}: gives {each.image} more than one pose; remove all but one")
+        used.add(each.image)
+    rank = {name: at for at, name in enumerate(dict.fromkeys(each.sequence for each in posed))}
+    ordered = sorted(posed, key=lambda each: rank[each.sequence])
+    cameras_of = [each.camera for each in ordered if each.camera is not None]
+    times = [each.time_s for each in ordered if each.time_s is not None]
+    splits = [each.split for each in ordered if each.split is not None]
+    return Capture(
+        kind=kind,
+        images=tuple(each.image for each in ordered),
+        sequences=tuple(each.sequence for each in ordered),
+        world_from_cam=np.stack([each.world_from_cam for each in ordered]),
+        unit=unit,
+        choices=dict(choices),
+        cameras=dict(cameras or {}),
+        camera_of=tuple(cameras_of) if len(cameras_of) == len(ordered) else None,
+        time_s=np.array(times) if len(times) == len(ordered) else None,
+        split=tuple(splits) if len(splits) == len(ordered) else None,
+        poses_without_image=tuple(missing),
+        images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in used),
+    )
+
+
+def rigid(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
+    """Check transforms, and make rotations that were rounded in a text exact.
+
+    Args:
+        matrices: (N, 3, 4) or (N, 4, 4), finite.
+        where: names a row, for messages.
+
+    Returns:
+        (N, 4, 4).
+
+    Raises:
+        InputError: for a row that is no rigid transform.
+    """
+    tensor = torch.from_numpy(matrices)
+    _refuse(
+        ~is_rotation(tensor[:, :3, :3], _ROTATION_TOLERANCE).numpy(), where, "the pose's rotation is not orthonormal"
+    )
+    if matrices.shape[1] == 4:
+        is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
+        _refuse(~is_last, where, "the pose's last row is not 0 0 0 1")
+    _refuse(np.abs(matrices[:, :3, 3]).max(axis=1) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
+    return matrix_from_pose(pose_from_matrix(tensor)).numpy()
+
+
+def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[int], str]) -> tuple[Matrices, int]:
+    """Transforms of positions and quaternions.
+
+    Args:
+        position: (N, 3), finite.
+        quaternion: (N, 4), wxyz, finite; those that are about unit are made so.
+        where: names a row, for messages.
+
+    Returns:
+        (N, 4, 4), and how many quaternions were off by more than rounding.
+
+    Raises:
+        InputError: for a quaternion that is far from unit, or a position that cannot be one.
+    """
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
+    _refuse(~((norm > 0.5) & (norm < 2)), where, "the quaternion is far from unit length")
+    _refuse(np.abs(position).max(axis=1, initial=0) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
+    pose = Pose(torch.from_numpy(position.copy()), normalize(torch.from_numpy(quaternion.copy())))
+    return matrix_from_pose(pose).numpy(), int((np.abs(norm - 1) > _UNIT_TOLERANCE).sum())
+
+
+def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[float], where: str | Path) -> Camera:
+    """Check a pinhole camera; the centre of the top-left pixel is (0, 0).
+
+    Args:
+        size: width and height.
+        focal: along x and y.
+        centre: principal point.
+        where: the file, for messages.
+
+    Raises:
+        InputError: for a size that is none, or numbers that no lens has.
+    """
+    width, height = size
+    is_size = all(1 <= side <= LARGEST_PX and side == int(side) for side in size)
+    if not is_size or not all(np.isfinite([*focal, *centre])) or min(focal) <= 0:
+        raise InputError(f"{where}: a camera must have a size and finite, positive focal lengths; export it again")
+    if not (abs(centre[0] - width / 2) <= width / 4 and abs(centre[1] - height / 2) <= height / 4):
+        raise InputError(
+            f"{where}: principal point {centre[0]:.0f}, {centre[1]:.0f} is far from the centre of images of "
+            f"{width:.0f}x{height:.0f}; give the intrinsics of these images, not of others' size"
+        )
+    return Camera(int(width), int(height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
+
+
+def _refuse(is_bad: Any, where: Callable[[int], str], rule: str) -> None:
+    if np.any(is_bad):
+        raise InputError(f"{where(int(np.argmax(is_bad)))}: {rule}; correct or remove it")

@@ -1,0 +1,188 @@
+"""Text, JSON, numbers and names from a source that is not trusted: sound, or refused in one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.files import path_inside, read_json
+from mambaloc.images import PICTURES
+
+_MOST_BYTES = 1 << 26  # of a text: poses of a million images
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of numbers, and where each was read.
+
+    Args:
+        path: the file.
+        lines: N line numbers, from 1.
+        words: the first word of each.
+        numbers: (N, columns) float64.
+    """
+
+    path: Path
+    lines: tuple[int, ...]
+    words: tuple[str, ...]
+    numbers: NDArray[np.float64]
+
+    def where(self, row: int) -> str:
+        """Name a row, for a message."""
+        return f"{self.path}, line {self.lines[row]}"
+
+
+def read_text(path: Path, holds: str) -> str:
+    """Read a text file.
+
+    Args:
+        path: the file.
+        holds: what should be in it, for messages.
+
+    Raises:
+        InputError: where it is missing, cannot be read, or is too large to be one.
+    """
+    try:
+        if not path.is_file():
+            raise InputError(f"{path}: missing; it holds {holds}")
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; give a text that holds {holds}")
+        return path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); it holds {holds}") from None
+
+
+def read_lines(path: Path, holds: str) -> list[tuple[int, list[str]]]:
+    """The words of each line with its number, without blank lines and ``#`` comments; as :func:`read_text`."""
+    lines = enumerate(read_text(path, holds).splitlines(), start=1)
+    return [(number, line.split()) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def read_table(path: Path, columns: int, row: str, named: bool = False) -> Table:
+    """Read lines of so many finite numbers each.
+
+    Args:
+        path: the file.
+        columns: numbers in a line.
+        row: what a line is, for messages.
+        named: whether a word comes before the numbers.
+
+    Raises:
+        InputError: where it cannot be read, holds no line, or one of its lines is anything else.
+    """
+    lines = read_lines(path, f"a line each: {row}")
+    numbers = np.empty((len(lines), columns))
+    for at, (line, words) in enumerate(lines):
+        values = as_numbers(words[int(named) :])
+        if values is None or len(values) != columns or not np.isfinite(values).all():
+            raise InputError(f"{path}, line {line}: is no line {row!r} of finite numbers; correct or remove it")
+        numbers[at] = values
+    if not lines:
+        raise InputError(f"{path}: is empty; it holds a line each: {row}")
+    return Table(path, tuple(line for line, _ in lines), tuple(words[0] for _, words in lines), numbers)
+
+
+def as_numbers(words: Sequence[str]) -> NDArray[np.float64] | None:
+    """Numbers from words, not all of them finite perhaps; None where one is none."""
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError:
+        return None
+
+
+def read_object(path: Path, holds: str) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: where it cannot be read, or is none.
+    """
+    value = read_json(path, f"it holds {holds}", f"it holds {holds}, export it again")
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: is no JSON object; it holds {holds}, export it again")
+    return value
+
+
+def array_of(value: Any, shape: tuple[int | None, ...], name: str, path: Path) -> NDArray[np.float64]:
+    """Finite numbers of a JSON value.
+
+    Args:
+        value: lists of numbers, or a number.
+        shape: what they must come in; None is any length.
+        name: of the value, for messages.
+        path: the file, likewise.
+
+    Raises:
+        InputError: for anything else.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):  # no numbers, ragged, or larger than a float
+        array = np.array(np.nan)
+    fits = array.ndim == len(shape) and all(want in (None, is_) for want, is_ in zip(shape, array.shape, strict=True))
+    if not fits or not np.isfinite(array).all():
+        size = " x ".join("N" if length is None else str(length) for length in shape) or "one"
+        raise InputError(f"{path}: {name!r} must be {size} finite numbers; export it again")
+    return array
+
+
+def inside(folder: Path, name: str, where: str) -> Path:
+    """The path of a file that a source names by its place in a folder; whether it is there is not asked.
+
+    Args:
+        folder: of the source.
+        name: relative path, with either kind of slash.
+        where: what names it, for messages.
+
+    Raises:
+        InputError: for a name that leads out of the folder, or is none that a file can have.
+    """
+    path = path_inside(folder, name)
+    if path is None:
+        raise InputError(f"{where}: names {name[:60]!r}, which is no file inside of {folder}; correct the name")
+    return path
+
+
+def natural(path: Path) -> tuple[tuple[int, str, int], ...]:
+    """Key to sort files as a person does: ``2.jpg`` before ``10.jpg``."""
+    words = re.split(r"([0-9]+)", path.as_posix())
+    return tuple((1, "", int(word)) if number % 2 else (0, word, 0) for number, word in enumerate(words))
+
+
+def pictures(folder: Path) -> list[Path]:
+    """The pictures in a folder in natural order, without depth; none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(
+        (p for p in folder.iterdir() if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural
+    )
+
+
+def first_with_pictures(folders: Sequence[Path]) -> Path:
+    """The first of some folders that holds pictures.
+
+    Raises:
+        InputError: where none does.
+    """
+    for folder in folders:
+        if pictures(folder):
+            return folder
+    names = ", ".join(str(folder) for folder in folders)
+    raise InputError(f"{names}: none holds a picture ({', '.join(PICTURES)}); put the images there")
+
+
+def folder_name(folder: Path) -> str:
+    """What a folder is called, also where it is given as ``.``."""
+    return folder.resolve().name or "recording"
+
+
+def number_of(path: Path) -> int:
+    """The number that a file is named by, as 12 of ``frame000012.jpg``; -1 where it has none, or several."""
+    numbers = re.findall(r"[0-9]+", path.stem)
+    return int(numbers[0]) if len(numbers) == 1 else -1
