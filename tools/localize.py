@@ -1,11 +1,11 @@
-"""Localise pictures: python tools/localize.py [MODEL] VIDEO_OR_FOLDER_OR_CAMERA [--out poses.tum] [--threads N]."""
+"""Localise pictures: python tools/localize.py [MODEL] VIDEO_OR_FOLDER_OR_CAMERA [--filter causal|smooth]."""
 
 import argparse
 from pathlib import Path
 
 from mambaloc.console import exits_cleanly, thread_count
 from mambaloc.runtime import Localiser
-from mambaloc.runtime.report import follow
+from mambaloc.runtime.report import FILTERS, follow
 
 
 @exits_cleanly
@@ -17,11 +17,13 @@ def main() -> None:
     )
     parser.add_argument("source", help="a video, a picture, a folder of pictures, or a camera's number")
     parser.add_argument("--out", type=Path, default=Path("poses.tum"), help="trajectory to write, TUM format")
+    parser.add_argument("--filter", choices=FILTERS, help="steady a video's poses: from those before, or from all")
     parser.add_argument("--threads", type=thread_count, help="that one image may use")
     args = parser.parse_args()
     localiser = Localiser(_model(args.model), args.threads)
-    count, latency_ms = follow(localiser, args.source, args.out)
-    print(f"{args.out}: {count} poses in {localiser.contract.scene}, median {latency_ms:.1f} ms a frame")
+    done = follow(localiser, args.source, args.out, args.filter)
+    poses = f"{done.count} poses" + (f" ({done.outliers} outliers)" if args.filter else "")
+    print(f"{args.out}: {poses} in {localiser.contract.scene}, median {done.latency_ms:.1f} ms a frame")
 
 
 def _model(name: str | None) -> Path:

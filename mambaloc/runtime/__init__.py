@@ -2,7 +2,19 @@
 
 from mambaloc.runtime.contract import Contract, Preprocessing
 from mambaloc.runtime.localiser import Localisation, Localiser
+from mambaloc.runtime.pose_filter import Noise, PoseEstimate, PoseFilter, smooth
 from mambaloc.runtime.sources import frames_of
 from mambaloc.runtime.trajectory import write_tum
 
-__all__ = ["Contract", "Localisation", "Localiser", "Preprocessing", "frames_of", "write_tum"]
+__all__ = [
+    "Contract",
+    "Localisation",
+    "Localiser",
+    "Noise",
+    "PoseEstimate",
+    "PoseFilter",
+    "Preprocessing",
+    "frames_of",
+    "smooth",
+    "write_tum",
+]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +39,7 @@ def frames_of(source: str | Path) -> tuple[Iterator[SourceFrame], int | None]:
         InputError: where there is no such source, or nothing in it.
     """
     if str(source).isdecimal():
-        return _of_capture(_opened(int(str(source)), f"camera {source}")), None
+        return _of_capture(_opened(int(str(source)), f"camera {source}"), live=True), None
     path = Path(source)
     if path.is_dir():
         pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES and ".depth." not in p.name)
@@ -69,15 +71,20 @@ def _opened(what: str | int, name: str) -> cv2.VideoCapture:
     return capture
 
 
-def _of_capture(capture: cv2.VideoCapture) -> Iterator[SourceFrame]:
+def _of_capture(capture: cv2.VideoCapture, live: bool = False) -> Iterator[SourceFrame]:
+    """Frames with times that always grow; a camera's are the clock's, as few cameras tell theirs."""
+    rate_hz = capture.get(cv2.CAP_PROP_FPS)
+    frame_s = 1 / rate_hz if rate_hz > 0 else 1 / 30
+    began_s, time_s = 0.0, -frame_s
     try:
-        number = 0
-        while True:
+        for number in itertools.count():
             read, image = capture.read()
             if not read:
                 break
-            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000  # of the frame just read
+            stamp_s = time.monotonic() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000  # of the frame just read
+            began_s = began_s if number else stamp_s
+            # Some streams have no stamps, and where films were joined they may start again.
+            time_s = stamp_s - began_s if stamp_s - began_s > time_s else time_s + frame_s
             yield SourceFrame(str(number), time_s, image[..., ::-1])  # type: ignore[arg-type]
-            number += 1
     finally:
         capture.release()

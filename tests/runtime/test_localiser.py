@@ -17,7 +17,7 @@ from mambaloc.export import contract_of, export_onnx
 from mambaloc.geometry import canonical
 from mambaloc.images import as_rgb, read_image
 from mambaloc.models.student import LitStudent
-from mambaloc.runtime import Contract, Localiser, Preprocessing, frames_of
+from mambaloc.runtime import Contract, Localiser, PoseFilter, Preprocessing, frames_of, smooth
 from mambaloc.runtime.report import follow
 
 DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 48}
@@ -214,6 +214,49 @@ def test_a_video_is_read_with_its_times(tmp_path):
     assert np.abs(listed[2].image.astype(int) - picture(seed=2)).mean() < 6  # JPEG
 
 
+class FakeCapture:
+    """A stream of four frames with the time stamps that it is told to have."""
+
+    def __init__(self, stamps_ms, fps):
+        self.left, self.fps, self.stamp_ms = list(stamps_ms), fps, 0.0
+
+    def isOpened(self):
+        return True
+
+    def read(self):
+        if not self.left:
+            return False, None
+        self.stamp_ms = self.left.pop(0)
+        return True, picture()
+
+    def get(self, what):
+        return {cv2.CAP_PROP_FPS: self.fps, cv2.CAP_PROP_POS_MSEC: self.stamp_ms}.get(what, 0.0)
+
+    def release(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "fps", "times_s"),
+    [
+        ([0, 0, 0, 0], 20, [0, 0.05, 0.1, 0.15]),  # a raw stream has none
+        ([0, 0, 0, 0], 0, [0, 1 / 30, 2 / 30, 3 / 30]),
+        ([500, 600, 0, 800], 10, [0, 0.1, 0.2, 0.3]),
+    ],
+)
+def test_times_grow_where_stamps_do_not(stamps_ms, fps, times_s, tmp_path, monkeypatch):
+    (tmp_path / "film.h264").write_bytes(b"any")
+    monkeypatch.setattr(cv2, "VideoCapture", lambda what: FakeCapture(stamps_ms, fps))
+    assert [frame.time_s for frame in frames_of(tmp_path / "film.h264")[0]] == pytest.approx(times_s)
+
+
+def test_a_cameras_times_are_the_clocks(monkeypatch):
+    clock_s = iter([100.0, 100.1, 100.4, 100.5])
+    monkeypatch.setattr(cv2, "VideoCapture", lambda what: FakeCapture([0] * 4, 30))
+    monkeypatch.setattr("mambaloc.runtime.sources.time.monotonic", lambda: next(clock_s))
+    assert [frame.time_s for frame in frames_of("0")[0]] == pytest.approx([0, 0.1, 0.4, 0.5])
+
+
 def test_a_source_is_localised_frame_by_frame(model, tmp_path):
     for name, seed in (("a.png", 0), ("b.png", 1)):
         cv2.imwrite(str(tmp_path / name), picture(seed=seed)[..., ::-1])
@@ -230,6 +273,50 @@ def test_what_was_found_before_a_bad_picture_is_kept(model, tmp_path):
     with pytest.raises(InputError, match=r"b\.png: image cannot be decoded"):
         follow(Localiser(model), str(tmp_path), out)
     assert len(out.read_text().splitlines()) == 2  # a comment, and the first
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for seed in range(40):
+        cv2.imwrite(str(folder / f"{seed:02d}.png"), picture(seed=seed)[..., ::-1])
+    return folder
+
+
+@pytest.mark.parametrize("filtering", ["causal", "smooth"])
+def test_a_filters_poses_are_written(filtering, model, pictures, tmp_path):
+    found = [pose for _, pose in Localiser(model).localise_each(pictures)]
+    positions_m, quaternions = (np.stack([getattr(p, of) for p in found]) for of in ("position_m", "quaternion"))
+    times_s = np.arange(40) / 30
+    if filtering == "smooth":
+        expected = smooth(times_s, positions_m, quaternions)
+    else:
+        keep = PoseFilter()
+        expected = [keep.update(*pose) for pose in zip(times_s, positions_m, quaternions, strict=True)]
+    done = follow(Localiser(model), str(pictures), tmp_path / "poses.tum", filtering)
+    written = np.loadtxt(tmp_path / "poses.tum")
+    assert (done.count, done.outliers) == (40, sum(pose.is_outlier for pose in expected))
+    np.testing.assert_array_equal(written[:, 0], np.arange(40))
+    np.testing.assert_allclose(written[:, 1:4], [pose.position_m for pose in expected], atol=1e-6)
+    np.testing.assert_allclose(written[:, [7, 4, 5, 6]], [pose.quaternion for pose in expected], atol=1e-6)
+    jerks = (np.abs(np.diff(way, 2, axis=0)).mean() for way in (written[:, 1:4], positions_m))
+    assert next(jerks) < 0.8 * next(jerks)
+
+
+@pytest.mark.parametrize("filtering", [None, "causal", "smooth"])
+def test_ctrl_c_writes_what_was_found(filtering, model, pictures, tmp_path, monkeypatch):
+    localiser = Localiser(model)
+    localise, left = localiser.localise, iter(range(5))
+
+    def interrupted(image):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return localise(image)
+
+    monkeypatch.setattr(localiser, "localise", interrupted)
+    assert follow(localiser, str(pictures), tmp_path / "poses.tum", filtering).count == 5
+    assert np.loadtxt(tmp_path / "poses.tum").shape == (5, 8)
 
 
 def test_where_poses_go_is_asked_before_the_work(model, tmp_path):
