@@ -30,6 +30,7 @@ from mambaloc.importing.untrusted import (
 
 _ROW = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 _IMAGE_FOLDERS = ("image_2", "image_0", "images", "image", "rgb", "color", "frames", ".")
+_FARTHEST_M = 10.0  # between two cameras of one car
 _CHOICES = {
     "axes": "OpenCV camera axes, as the format has them",
     "direction": "camera-to-world, as the format has it",
@@ -139,7 +140,10 @@ def _camera(calibration: Path, name: str, image: Path) -> tuple[Camera, Matrices
     height, width = read_image(image).shape[:2]
     camera = pinhole((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), calibration)
     cam0_from_cam = np.eye(4)
-    cam0_from_cam[:3, 3] = -np.linalg.solve(matrix, projection[:, 3])
+    with np.errstate(over="ignore", invalid="ignore"):
+        cam0_from_cam[:3, 3] = -np.linalg.solve(matrix, projection[:, 3])
+    if not np.abs(cam0_from_cam[:3, 3]).max() <= _FARTHEST_M:
+        raise InputError(f"{calibration}: '{key}' is more than {_FARTHEST_M:g} m from camera 0; get it again")
     return camera, cam0_from_cam
 
 

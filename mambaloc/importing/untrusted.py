@@ -156,12 +156,16 @@ def natural(path: Path) -> tuple[tuple[int, str, int], ...]:
 
 
 def pictures(folder: Path) -> list[Path]:
-    """The pictures in a folder in natural order, without depth; none where there is no such folder."""
-    if not folder.is_dir():
-        return []
-    return sorted(
-        (p for p in folder.iterdir() if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural
-    )
+    """The pictures in a folder in natural order, without depth; none where there is no such folder.
+
+    Raises:
+        InputError: where it may not be read.
+    """
+    try:
+        files = list(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}); make it readable") from None
+    return sorted((p for p in files if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural)
 
 
 def first_with_pictures(folders: Sequence[Path]) -> Path:

@@ -123,6 +123,8 @@ def test_several_sequences_are_several_worlds(kitti, refused):
             "P2: 9 0 600 0 0 9 24 0 0 0 1 0\n",
             "principal point 600, 24 is far from the centre",
         ),
+        ("sequences/07/calib.txt", "P2: 9 0 32 900 0 9 24 0 0 0 1 0\n", "is more than 10 m from camera 0"),
+        ("sequences/07/calib.txt", "P2: 1e-300 0 32 1e300 0 9 24 0 0 0 1 0\n", "is more than 10 m from camera 0"),
         ("sequences/07/calib.txt", "P2: inf 0 32 0 0 9 24 0 0 0 1 0\n", "has no line 'P2:' of 12 finite numbers"),
         ("sequences/07/times.txt", "0\n1\n", "times.txt: has 2 times for 6 poses"),
         ("sequences/07/times.txt", "0\n1 2\n", "times.txt, line 2: is no line 'seconds'"),
