@@ -284,7 +284,7 @@ def test_the_tool_says_what_it_found(rendered_once, tmp_path, capsys):
         (["{room}", "--out", "{tmp}/a", "--metres-per-unit", "nan"], "--metres-per-unit nan: give a number"),
         (["{room}", "--out", "{tmp}/a", "--split", "given"], "--split given: this capture has no split of its own"),
         (["{room}", "--out", "{tmp}/a", "--split", "sequence"], "this capture has one sequence; choose one of auto"),
-        (["{room}/images", "--out", "{tmp}/a"], "looks like no format that is known"),
+        (["{tmp}", "--out", "{tmp}/a"], "looks like no format that is known"),
         (["{room}", "--out", "{tmp}/file/a"], "choose another folder with --out"),
     ],
 )
