@@ -115,8 +115,8 @@ class PoseDataModule(L.LightningDataModule):
         is_bad = focal_ratio not in (None, "scene") and not (isinstance(focal_ratio, int | float) and focal_ratio > 0)
         if is_bad or (focal_ratio is not None and points_per_frame > 0):
             raise InputError(
-                f"data.focal_ratio {focal_ratio}: must be more than 0, or 'scene', and is not for scene points, whose "
-                "intrinsics follow the crop; leave it out"
+                f"data.focal_ratio {focal_ratio}: must be more than 0, and is not for scene points, whose intrinsics "
+                "follow the crop; leave it out, or say 'scene'"
             )
         self.jitter = Jitter(brightness, contrast, saturation)
         self._loaded: dict[Part, LoadedSplit] = {}

@@ -299,5 +299,5 @@ def test_crops_turn_by_the_scenes_own_focal_length(scene, tmp_path):
     assert not torch.allclose(asked, plain)
     edit_row(scene, 0, "camera", "")
     torch.testing.assert_close(*turned(focal_ratio="scene"))
-    with pytest.raises(InputError, match="or 'scene'"):
+    with pytest.raises(InputError, match="or say 'scene'"):
         module(scene, tmp_path, focal_ratio="guess")

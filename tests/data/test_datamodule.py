@@ -299,7 +299,7 @@ def test_rotations_turn_with_the_crop_where_the_focal_length_is_known(make):
 
 @pytest.mark.parametrize("options", [{"focal_ratio": 0.0}, {"focal_ratio": 0.9, "points_per_frame": 5}])
 def test_a_focal_length_that_cannot_be_used(make, options):
-    with pytest.raises(InputError, match=r"data\.focal_ratio .*: must be more than 0, or 'scene', and is not for scene"):
+    with pytest.raises(InputError, match=r"data\.focal_ratio .*: must be more than 0, and is not for scene points"):
         make(**options)
 
 
