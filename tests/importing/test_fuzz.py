@@ -181,5 +181,5 @@ def test_damaged_colmap_models(colmap, binary, file, data):
 
 
 def test_no_text_format_is_left_out():
-    others = {"colmap", "structure_from_motion", "csv_world_from_cam", "csv_cam_from_world"}
+    others = {"colmap", "structure_from_motion", "csv_world_from_cam", "csv_cam_from_world", "nerfstudio"}
     assert set(SOURCES) == set(FORMATS) - others
