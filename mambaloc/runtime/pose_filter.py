@@ -8,8 +8,8 @@ A network errs alike on frames that look alike, so its errors are not white: fil
 little of the error that neighbours share.
 
 Convention
-    Poses are ``world_from_cam``; quaternions are wxyz, of either sign and any length. Times are seconds. Pictures of a
-    folder, whose times are places in a list, count as :data:`PICTURES_HZ` a second.
+    Poses are ``world_from_cam``; quaternions are wxyz, of either sign and any length. Times are seconds: those of a
+    folder's pictures, which are places in a list, are to be divided by the rate they were taken at.
     Covariances (12, 12) are of the error: position [m], velocity [m/s], rotation [rad] and angular velocity [rad/s],
     these two in the camera's axes.
 """
@@ -28,7 +28,7 @@ from mambaloc.errors import InputError
 
 Array = NDArray[np.float64]
 
-PICTURES_HZ = 30.0
+PICTURES_HZ = 30.0  # what tools take the rate of a folder's pictures to be
 
 _POSITION, _VELOCITY, _ROTATION, _TURN = (slice(start, start + 3) for start in range(0, 12, 3))
 _MEASURED, _RATES = np.r_[_POSITION, _ROTATION], np.r_[_VELOCITY, _TURN]
@@ -70,9 +70,8 @@ class Noise:
         """What errors a video's poses seem to have where a hand moves the camera.
 
         A pose's distance from the line between those a quarter of a second before and after shows an error, less what
-        motion adds. Four fifths of the distances are looked at, not the far ones, which are outliers; and the error is
-        taken to be twice what they show, as much of it is common to all three. (On frames held out of training and on
-        rendered ones, half and twice as much make no difference that counts.)
+        motion adds. The far fifth of distances are outliers, and errors are twice what the others show, as much of them
+        is common to all three (half or twice as much made little difference on frames held out, and on rendered ones).
 
         Args:
             time_s: (N,), in order; N is 3 or more.
@@ -115,7 +114,7 @@ class PoseEstimate:
         turn_rad_s: rate of the rotation.
         covariance: of the error, as the head of this file says.
         is_outlier: the measured pose was left out.
-        begins: nothing before this pose counts: it is the first, or a jump was believed here.
+        begins: nothing before this pose counts: it is one of the first, or a jump was believed here.
     """
 
     position_m: Array
@@ -159,7 +158,7 @@ class PoseFilter:
         measured = _Measured.of(time_s, position_m, quaternion)
         if not (np.isfinite(measured.time_s) and measured.time_s >= self._time_s):
             raise InputError(f"pose at {time_s} s: comes after {self._time_s} s; give poses in order of time")
-        if self._learns and measured.is_finite:
+        if self._learns:
             self._learn(measured)
         if self._estimate is None or self._noise is None:
             estimate = _begun(measured, self._noise or Noise())

@@ -1,11 +1,14 @@
 """The pose filter against a linear Kalman filter, least squares over a whole track, and SciPy's rotations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from mambaloc.errors import InputError
 from mambaloc.runtime import Noise, PoseFilter, smooth
+from mambaloc.runtime.pose_filter import _moved, _predicted
 
 NOISE = Noise(position_m=0.1, rotation_deg=4.0)
 ACCELERATION_M_S2, ACCELERATION_DEG_S2 = NOISE.acceleration_m_s2, NOISE.acceleration_deg_s2
@@ -136,6 +139,22 @@ def test_a_constant_turn_is_recovered():
     np.testing.assert_allclose(exact[-1].turn_rad_s, turn_rad_s, atol=1e-4)
 
 
+def test_errors_move_as_the_state_does():
+    """The matrix that moves errors on is the derivative of the motion, but for the curvature of a turn."""
+    estimate = PoseFilter(NOISE).update(0, [1, 2, 3], wxyz(Rotation.random(random_state=1)))
+    estimate = replace(estimate, velocity_m_s=np.array([1.0, 2, 3]), turn_rad_s=np.array([1.0, -2, 2]))
+    step_s, tiny = 0.1, 1e-6
+    predicted, motion, _ = _predicted(estimate, step_s, NOISE)
+    after = Rotation.from_quat(predicted.quaternion, scalar_first=True)
+    for column, error in enumerate(tiny * np.eye(12)):
+        moved, *_ = _predicted(_moved(estimate, error, estimate.covariance), step_s, NOISE)
+        turned = (after.inv() * Rotation.from_quat(moved.quaternion, scalar_first=True)).as_rotvec()
+        off = [moved.position_m - predicted.position_m, moved.velocity_m_s - predicted.velocity_m_s]
+        derivative = np.concatenate([*off, turned, moved.turn_rad_s - predicted.turn_rad_s]) / tiny
+        curved = step_s * np.linalg.norm(estimate.turn_rad_s) * step_s / 2 if column >= 9 else 0
+        np.testing.assert_allclose(motion[:, column], derivative, atol=1e-6 + curved)
+
+
 def test_covariances_say_how_far_off_it_is():
     """Squared errors in units of the covariance average to its 12 dimensions (Bar-Shalom's consistency)."""
     time_s, true_m, true, *measured = hand_held(600, seed=6)
@@ -173,6 +192,15 @@ def test_errors_are_learned_at_any_rate(step_s):
     assert (learned.position_m, learned.rotation_deg) == pytest.approx((0.2, 8.0), rel=0.1)
     measured_m[np.random.default_rng(0).permutation(count)[: count // 20]] += 2
     assert Noise.learned(time_s, measured_m, measured).position_m == pytest.approx(0.2, rel=0.6)
+
+
+def test_motion_is_not_taken_for_error():
+    """At one pose in two seconds a hand's motion is most of what shows."""
+    time_s, true_m, *_ = hand_held(400, seed=8, step_s=2.0)
+    learned = Noise.learned(time_s, true_m, np.tile((1.0, 0, 0, 0), (400, 1)))
+    off_m = true_m[1:-1] - (true_m[:-2] + true_m[2:]) / 2
+    assert learned.position_m < 0.7 * 2 * off_m.std() / np.sqrt(1.5)
+    assert learned.rotation_deg == 1
 
 
 def test_a_large_scene_needs_no_tuning():
