@@ -55,7 +55,7 @@ class Teacher:
     def __call__(self, image: Tensor) -> Answers:
         """Localise images, (B, 3, H, W) in 0..1."""
         network = self.system.to(image.device).network
-        branches = network.features(image)
+        branches = network.features(network.backbone(image))
         prediction = network.head(*branches)
         return Answers(prediction.position_m, prediction.quaternion, torch.cat(branches, dim=-1))
 
@@ -159,7 +159,7 @@ class LitDistillation(LitStudent):
     def on_fit_start(self) -> None:
         """With ``cache_teacher``, ask it for every training frame."""
         if self.hparams["cache_teacher"]:
-            images = self.scene_for("cache_teacher").centred_training_images()
+            images = self.scene_for("cache_teacher").centred_images("train")
             shown = track(images, "Asking the teacher", transient=True, disable=self.global_rank > 0)
             answers = [self.teacher(image.to(self.device)) for image in shown]
             self.answers = Answers(*(torch.cat(each) for each in zip(*answers, strict=True)))

@@ -32,7 +32,7 @@ def main() -> None:
     )
     written = write_bundle(system, data, out, formats, args.target, args.raw_input)
     print_deviations(written.deviations)
-    print(*filter(None, [written.int8, f"wrote {out}"]), sep="\n")
+    print(*filter(None, [written.int8, written.unsure, f"wrote {out}"]), sep="\n")
 
 
 if __name__ == "__main__":

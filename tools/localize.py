@@ -24,6 +24,9 @@ def main() -> None:
     done = follow(localiser, args.source, args.out, args.filter)
     poses = f"{done.count} poses" + (f" ({done.outliers} outliers)" if args.filter else "")
     print(f"{args.out}: {poses} in {localiser.contract.scene}, median {done.latency_ms:.1f} ms a frame")
+    if done.radii:
+        metres, degrees = done.radii
+        print(f"nine of ten within {metres:.2g} m and {degrees:.2g}°; {done.unfamiliar} do not look like the place")
 
 
 def _model(name: str | None) -> Path:

@@ -7,8 +7,10 @@ from pathlib import Path
 import lightning as L
 from lightning.pytorch.utilities import rank_zero_info
 
+from mambaloc.errors import InputError
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.models import LitPoseRegressor, load_checkpoint
+from mambaloc.uncertainty import fit_uncertainty
 
 
 class OnnxExport(L.Callback):
@@ -29,5 +31,10 @@ class OnnxExport(L.Callback):
         best = getattr(trainer.checkpoint_callback, "best_model_path", "")
         path = Path(trainer.default_root_dir) / "model.onnx"
         system = load_checkpoint(best) if best else pl_module
-        parity = export_onnx(system, path, contract_of(system, trainer.datamodule.hparams))  # type: ignore[attr-defined]
-        rank_zero_info(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch")
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        try:
+            uncertainty, told = fit_uncertainty(system, data), "tells how sure it is"
+        except InputError as error:
+            uncertainty, told = None, f"tells no uncertainty: {error}"
+        parity = export_onnx(system, path, contract_of(system, data.hparams, uncertainty), uncertainty)
+        rank_zero_info(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch; {told}")

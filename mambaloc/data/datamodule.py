@@ -207,11 +207,17 @@ class PoseDataModule(L.LightningDataModule):
         """Test batches in order, for predictions without errors."""
         return self.test_dataloader()
 
-    def centred_training_images(self) -> Iterator[Tensor]:
-        """Centre crops of every training frame in the order of ``PoseBatch.index``, (B, 3, H, W) in 0..1."""
-        images, size = self._loaded["train"].data.images, self.hparams["eval_batch_size"]
-        for start in range(0, len(images), size):
-            yield center_crop(torch.from_numpy(np.array(images[start : start + size])), self.crop)
+    def centred_images(self, part: Part, most: int | None = None) -> Iterator[Tensor]:
+        """Centre crops of a part's frames in the order of ``PoseBatch.index``, (B, 3, H, W) in 0..1.
+
+        Args:
+            part: of those that are set up.
+            most: so many at most, evenly spread; all of them unless given.
+        """
+        images, size = self._loaded[part].data.images, self.hparams["eval_batch_size"]
+        rows = np.linspace(0, len(images) - 1, min(most or len(images), len(images))).round().astype(int)
+        for start in range(0, len(rows), size):
+            yield center_crop(torch.from_numpy(images[rows[start : start + size]]), self.crop)
 
     def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
         """Crop and normalise on the device, jitter while training; intrinsics follow each image's crop."""

@@ -70,7 +70,7 @@ def frozen_features(backbone: PooledBackbone, data: PoseDataModule) -> tuple[Ten
         data: set up for ``fit`` and ``test``.
     """
     backbone.eval()
-    train = [backbone(image) for image in data.centred_training_images()]
+    train = [backbone(image) for image in data.centred_images("train")]
     test = [backbone(data.on_after_batch_transfer(batch, 0).image) for batch in data.test_dataloader()]
     return torch.cat(train), torch.cat(test)
 

@@ -27,6 +27,7 @@ from mambaloc.images import read_image
 from mambaloc.models import LitPoseRegressor
 from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, replay, verify_bundle
 from mambaloc.runtime.contract import METADATA_KEY, MODEL_FILES, Contract
+from mambaloc.uncertainty import UncertaintyHead, fit_uncertainty
 
 FORMATS = tuple(MODEL_FILES)
 TRAJECTORY_FILE = "trajectory.json"
@@ -42,10 +43,12 @@ class WrittenBundle:
     Args:
         deviations: of each model in the bundle from PyTorch.
         int8: how quantisation went, where it was asked for; left out unless it ``fits``.
+        unsure: why the models cannot tell how sure a pose is, where they cannot.
     """
 
     deviations: list[Deviation]
     int8: EightBit | None
+    unsure: str | None
 
 
 def write_bundle(
@@ -77,7 +80,11 @@ def write_bundle(
     data.setup("test")
     status = Console(stderr=True).status(f"exporting {system.registry_name}")
     with status, whole_folder(out, "choose another folder with --out") as partial:
-        contract, int8 = _write_models(system, data, partial, formats, raw_input)
+        try:
+            uncertainty, unsure = fit_uncertainty(system, data), None
+        except InputError as error:
+            uncertainty, unsure = None, f"the models tell no uncertainty: {error}"
+        contract, int8 = _write_models(system, data, partial, formats, raw_input, uncertainty)
         written = [name for name in formats if (partial / MODEL_FILES[name]).is_file()]
         if not written:
             raise InputError(f"{out}: nothing to write: {int8}")
@@ -90,16 +97,21 @@ def write_bundle(
         if bad := [each for each in deviations if not each.within]:
             worst = f"{bad[0].position_mm:.2g} mm and {bad[0].rotation_deg:.2g} deg"
             raise InputError(f"{out / bad[0].file}: deviates by {worst} from PyTorch, so no bundle was written")
-    return WrittenBundle(deviations, int8)
+    return WrittenBundle(deviations, int8, unsure)
 
 
 def _write_models(
-    system: LitPoseRegressor, data: PoseDataModule, folder: Path, formats: Sequence[str], raw_input: bool
+    system: LitPoseRegressor,
+    data: PoseDataModule,
+    folder: Path,
+    formats: Sequence[str],
+    raw_input: bool,
+    uncertainty: UncertaintyHead | None,
 ) -> tuple[Contract, EightBit | None]:
-    plain = contract_of(system, data.hparams)
+    plain = contract_of(system, data.hparams, uncertainty)
     contract = replace(plain, preprocessing=replace(plain.preprocessing, in_model=raw_input))
     network = folder / MODEL_FILES["onnx"]
-    export_onnx(system, network, plain)
+    export_onnx(system, network, plain, uncertainty)
     model = onnx.load(network)
     int8 = eight_bit(model, data) if "int8" in formats else None
     models = {"onnx": model}

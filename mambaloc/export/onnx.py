@@ -21,11 +21,13 @@ from torch.export import Dim
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
-from mambaloc.nn import PositionScale
+from mambaloc.nn import PoseNetwork, PositionScale
 from mambaloc.runtime.contract import METADATA_KEY, Contract, Preprocessing
+from mambaloc.uncertainty import UncertaintyHead, pooled
 
 OPSET = 18
 _CHECKED_BATCHES = (1, 3)
+_TOLERANCE = 0.01  # of a radius, over itself
 
 
 @dataclass(frozen=True)
@@ -36,32 +38,46 @@ class Parity:
         position_m: of positions.
         rotation_deg: of rotations.
         reach_m: largest distance from the scene's origin that PyTorch said; float32 rounds in proportion to it.
+        uncertainty: of radii and unfamiliarity, over PyTorch's; 0 for a model that tells none.
     """
 
     position_m: float
     rotation_deg: float
     reach_m: float
+    uncertainty: float = 0.0
 
 
 class DeployedNetwork(nn.Module):
     """The network as an app sees it: plain tensors out, the quaternion canonical.
 
+    Args:
+        network: of the system.
+        uncertainty: tells how sure each pose is.
+
     Shape:
-        (B, 3, H, W) in 0..1 -> (B, 3) in metres and (B, 4) unit wxyz with ``w >= 0``.
+        (B, 3, H, W) in 0..1 -> (B, 3) in metres and (B, 4) unit wxyz with ``w >= 0``; with ``uncertainty`` three of
+        (B,) follow, those of :class:`~mambaloc.uncertainty.UncertaintyHead`.
     """
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: PoseNetwork, uncertainty: UncertaintyHead | None = None) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.uncertainty = network, uncertainty
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
         """Localise images."""
-        prediction = self.network(image)
-        return prediction.position_m, canonical(prediction.quaternion)
+        feats = self.network.backbone(image)
+        prediction = self.network.head(*self.network.features(feats))
+        pose = (prediction.position_m, canonical(prediction.quaternion))
+        return pose if self.uncertainty is None else (*pose, *self.uncertainty(pooled(feats)))
 
 
 def export_onnx(
-    system: LitPoseRegressor, path: Path, contract: Contract, tolerance_m: float = 1e-3, tolerance_deg: float = 0.05
+    system: LitPoseRegressor,
+    path: Path,
+    contract: Contract,
+    uncertainty: UncertaintyHead | None = None,
+    tolerance_m: float = 1e-3,
+    tolerance_deg: float = 0.05,
 ) -> Parity:
     """Write a system's network as ONNX, with any batch size, and check it in ONNX Runtime.
 
@@ -69,6 +85,7 @@ def export_onnx(
         system: trained; left as it was.
         path: the file; it appears only once it is complete and has passed.
         contract: what the file tells of itself; :func:`contract_of` makes it.
+        uncertainty: for a model that tells how sure each pose is.
         tolerance_m: largest position difference allowed, in metres per metre of the scene's size (at least one) or of
             the distance that the network says: noise may lead it far out of the scene.
         tolerance_deg: largest rotation difference allowed.
@@ -76,14 +93,15 @@ def export_onnx(
     Raises:
         InputError: where ONNX Runtime disagrees with PyTorch, or the file cannot be written.
     """
-    deployed = DeployedNetwork(copy.deepcopy(system.network).cpu().float()).eval()
+    deployed = DeployedNetwork(copy.deepcopy(system.network).cpu().float(), uncertainty).eval()
     partial = path.with_name(f".{path.name}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(deployed, contract, partial)
         parity = check_parity(deployed, partial, system.image_size)
         size_m = max(1.0, _largest_position_m(deployed), parity.reach_m)
-        if not (parity.position_m <= tolerance_m * size_m and parity.rotation_deg <= tolerance_deg):
+        is_close = parity.position_m <= tolerance_m * size_m and parity.rotation_deg <= tolerance_deg
+        if not (is_close and parity.uncertainty <= _TOLERANCE):
             raise InputError(
                 f"{path}: ONNX Runtime differs from PyTorch by {parity.position_m:.2g} m and "
                 f"{parity.rotation_deg:.2g} deg, so it was not written; report the model and the versions"
@@ -97,16 +115,20 @@ def export_onnx(
     return parity
 
 
-def contract_of(system: LitPoseRegressor, data: Mapping[str, Any]) -> Contract:
+def contract_of(
+    system: LitPoseRegressor, data: Mapping[str, Any], uncertainty: UncertaintyHead | None = None
+) -> Contract:
     """Say what a system's exported network promises.
 
     Args:
         system: trained.
         data: hyperparameters of the data module that it was trained with.
+        uncertainty: that the model will tell.
     """
     preprocessing = Preprocessing(data["short_side"], system.image_size)
     scene = f"{data['dataset']}/{data['scene']}"
-    return Contract(system.registry_name, scene, preprocessing, system.provenance, weights_sha256(system.network))
+    weights, radii = weights_sha256(system.network), None if uncertainty is None else uncertainty.describe()
+    return Contract(system.registry_name, scene, preprocessing, system.provenance, weights, radii)
 
 
 def weights_sha256(network: nn.Module) -> str:
@@ -122,16 +144,18 @@ def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], s
     """Compare a file with the network it came from, on random images in several batch sizes."""
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     generator = torch.Generator().manual_seed(seed)
-    position_m, rotation_deg, reach_m = [], [], []
+    position_m, rotation_deg, reach_m, uncertainty = [], [], [], [torch.zeros(())]
     for batch in _CHECKED_BATCHES:
         image = torch.rand(batch, 3, *image_size, generator=generator)
         with torch.inference_mode():
-            expected_m, expected_q = deployed(image)
-        actual_m, actual_q = (torch.from_numpy(a) for a in session.run(None, {"image": image.numpy()}))
+            expected_m, expected_q, *expected = deployed(image)
+        actual_m, actual_q, *actual = (torch.from_numpy(a) for a in session.run(None, {"image": image.numpy()}))
         position_m.append((actual_m - expected_m).norm(dim=-1).max())
         rotation_deg.append(rotation_error_deg(actual_q, expected_q).max())
         reach_m.append(expected_m.norm(dim=-1).max())
-    return Parity(*(torch.stack(each).max().item() for each in (position_m, rotation_deg, reach_m)))  # NaN stays NaN
+        uncertainty += [((a - e) / e).abs().max() for a, e in zip(actual, expected, strict=True)]
+    differences = (position_m, rotation_deg, reach_m, uncertainty)
+    return Parity(*(torch.stack(each).max().item() for each in differences))  # NaN stays NaN
 
 
 def _write(deployed: nn.Module, contract: Contract, path: Path) -> None:
@@ -141,7 +165,7 @@ def _write(deployed: nn.Module, contract: Contract, path: Path) -> None:
             deployed,
             (image,),
             input_names=["image"],
-            output_names=["position_m", "quaternion_wxyz"],
+            output_names=list(contract.outputs),
             dynamo=True,
             dynamic_shapes={"image": {0: Dim("batch")}},
             opset_version=OPSET,

@@ -44,7 +44,7 @@ def _join_casts(graph: onnx.GraphProto) -> None:
 
 
 def _after_last_products(graph: onnx.GraphProto) -> list[str]:
-    """Names of the nodes from the outputs back to the first product on each way, it included."""
+    """Names of the nodes from the outputs back to the first product, or mean over pixels, on each way, it included."""
     made_by = {output: node for node in graph.node for output in node.output}
     waiting, found = [output.name for output in graph.output], {}
     while waiting:
@@ -52,7 +52,7 @@ def _after_last_products(graph: onnx.GraphProto) -> list[str]:
         if node is None or node.name in found:
             continue
         found[node.name] = node
-        if node.op_type not in ("Gemm", "MatMul"):
+        if node.op_type not in ("Gemm", "MatMul", "ReduceMean", "GlobalAveragePool"):
             waiting += node.input
     return list(found)
 

@@ -95,7 +95,7 @@ def median_errors(model: onnx.ModelProto, data: PoseDataModule) -> dict[str, flo
     errors = PoseErrors()
     for fetched in data.test_dataloader():
         batch = data.on_after_batch_transfer(fetched, 0)
-        position_m, quaternion = (torch.from_numpy(o) for o in session.run(None, {"image": batch.image.numpy()}))
+        position_m, quaternion = (torch.from_numpy(o) for o in session.run(None, {"image": batch.image.numpy()})[:2])
         errors.update(PosePrediction(position_m, quaternion), batch)
     return summarise(errors.table())
 
@@ -123,11 +123,8 @@ def _prepared(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def _calibration_images(data: PoseDataModule) -> list[NDArray[np.float32]]:
-    """Training images evenly spread, one at a time: all of a scene's would fill the memory."""
-    count = len(data.frames("train"))
-    rows = set(np.linspace(0, count - 1, min(_CALIBRATION_FRAMES, count)).round().astype(int).tolist())
-    images = (image for batch in data.centred_training_images() for image in batch)
-    return [image[None].numpy().copy() for row, image in enumerate(images) if row in rows]
+    """Training images evenly spread, one at a time."""
+    return [image[None].numpy() for batch in data.centred_images("train", _CALIBRATION_FRAMES) for image in batch]
 
 
 def _quantised(model: onnx.ModelProto, images: Sequence[NDArray[np.float32]], kept: Sequence[str]) -> onnx.ModelProto:

@@ -68,9 +68,9 @@ class AtLoc(PoseNetwork):
         self.second_gis = build_gis(gis, width // 2, discretisation)
         self.head = PoseHead(width, "log_quaternion")
 
-    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both branches' global features, what their heads read; (B, width) each, the same one."""
-        first_BD, second_BD = self.dropout(self.attention(self.fc(self.backbone(image)))).chunk(2, dim=-1)
+    def features(self, feats: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn the backbone's feature into both branches' global features; (B, width) each, the same one."""
+        first_BD, second_BD = self.dropout(self.attention(self.fc(feats))).chunk(2, dim=-1)
         feats_BD = torch.cat((self.first_gis(first_BD), self.second_gis(second_BD)), dim=-1)
         return feats_BD, feats_BD
 

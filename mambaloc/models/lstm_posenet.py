@@ -48,9 +48,9 @@ class LSTMPoseNet(PoseNetwork):
         self.orientation_gis = build_gis(gis, 4 * hidden, discretisation)
         self.head = PoseHead(4 * hidden, rotation)
 
-    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both branches' global features, what their heads read; (B, 4 hidden) each."""
-        matrix_BRC = self.fc(self.backbone(image)).unflatten(-1, (_ROWS, _COLUMNS))
+    def features(self, feats: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn the backbone's feature into both branches' global features; (B, 4 hidden) each."""
+        matrix_BRC = self.fc(feats).unflatten(-1, (_ROWS, _COLUMNS))
         _, (vertical_2BE, _) = self.down_and_up(matrix_BRC)
         _, (horizontal_2BE, _) = self.right_and_left(matrix_BRC.mT)
         feats_BD = self.dropout(torch.cat((*vertical_2BE, *horizontal_2BE), dim=-1))

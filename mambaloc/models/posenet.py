@@ -57,13 +57,9 @@ class PoseNet(PoseNetwork):
         self.orientation_gis = build_gis(gis, width, discretisation)
         self.head = PoseHead(width, rotation)
 
-    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both branches' global features, what their heads read; (B, width) each."""
-        return self.features_of(self.backbone(image))
-
-    def features_of(self, pooled_BD: Tensor) -> tuple[Tensor, Tensor]:
-        """Turn the backbone's feature into both branches' features; (B, width) each."""
-        feats_BD = self.fc(pooled_BD)
+    def features(self, feats: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn the backbone's feature into both branches' global features; (B, width) each."""
+        feats_BD = self.fc(feats)
         return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
 
 
@@ -126,7 +122,7 @@ class GoogLeNetPoseNet(PoseNet):
         if not self.training:
             return super().forward(image)
         pooled_BD, *auxiliary = self.backbone.with_auxiliary(image)
-        prediction = self.head(*self.features_of(pooled_BD))
+        prediction = self.head(*self.features(pooled_BD))
         heads = zip(self.auxiliary_heads, auxiliary, strict=True)
         return replace(prediction, auxiliary=tuple(head(feats, feats) for head, feats in heads))
 

@@ -48,9 +48,9 @@ class Student(PoseNetwork):
         """Turn the latent feature into both branches' features; (B, width) each."""
         return self.position_gis(latent_BD), self.orientation_gis(latent_BD)
 
-    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both branches' global features, what their heads read; (B, width) each."""
-        return self.branches(self.latent(image))
+    def features(self, feats: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn the backbone's feature into both branches' global features; (B, width) each."""
+        return self.branches(self.fc(feats))
 
 
 @register_model("student")

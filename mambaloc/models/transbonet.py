@@ -136,9 +136,9 @@ class TransBoNet(PoseNetwork):
         self.orientation_gis = build_gis(gis, width, discretisation)
         self.head = PoseHead(width, hidden=head_hidden)
 
-    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both branches' global features, what their heads read; (B, width) each."""
-        (stride16_BCHW,) = self.backbone(image)
+    def features(self, feats: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Turn the feature map into both branches' global features; (B, width) each."""
+        (stride16_BCHW,) = feats
         feats_BD = self.fc(self.shuffle_attention(self.stage(stride16_BCHW)).mean((-2, -1)))
         return self.position_gis(feats_BD), self.orientation_gis(feats_BD)
 

@@ -63,9 +63,9 @@ class TransPoseNet(PoseNetwork):
         self.orientation_gis = build_gis(gis, dim, discretisation)
         self.head = PoseHead(dim, hidden=head_hidden)
 
-    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both branches' global features, what their heads read; (B, dim) each."""
-        stride8_BCHW, stride16_BCHW = self.backbone(image)
+    def features(self, feats: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Turn the two feature maps into both branches' global features; (B, dim) each."""
+        stride8_BCHW, stride16_BCHW = feats
         position_BD = self.position_gis(self.position_encoder(stride16_BCHW))
         orientation_BD = self.orientation_gis(self.orientation_encoder(stride8_BCHW))
         return position_BD, orientation_BD

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -108,8 +108,8 @@ class PoseNetwork(nn.Module):
     image_size: tuple[int, int] | None = None
     """(height, width) that the network was built for; None takes any."""
 
-    def features(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the position and the orientation branch's global features, (B, D) each."""
+    def features(self, feats: Any) -> tuple[Tensor, Tensor]:
+        """Turn what the backbone returns into the position and orientation branches' global features, (B, D) each."""
         raise NotImplementedError
 
     def forward(self, image: Tensor) -> PosePrediction:
@@ -120,4 +120,4 @@ class PoseNetwork(nn.Module):
         """
         if self.image_size is not None and image.shape[-2:] != torch.Size(self.image_size):
             raise ValueError(f"images are {tuple(image.shape[-2:])}, the network was built for {self.image_size}")
-        return self.head(*self.features(image))
+        return self.head(*self.features(self.backbone(image)))

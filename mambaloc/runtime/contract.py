@@ -17,6 +17,9 @@ RAW_INPUT = "rgb"
 MODEL_FILES = {"onnx": "model.onnx", "fp16": "model.fp16.onnx", "int8": "model.int8.onnx", "ort": "model.ort"}
 """What a bundle's models are called, by format, the most exact first."""
 
+UNCERTAINTY = ("position_radius_m", "rotation_radius_deg", "unfamiliarity")
+"""Outputs of a model that tells how sure it is."""
+
 POSE = (
     "world_from_cam: camera centre in metres, unit quaternion wxyz with w >= 0; "
     "OpenCV camera axes (x right, y down, z forward)"
@@ -52,6 +55,7 @@ class Contract:
         preprocessing: of its input.
         trained: provenance of its training: commit, seed, device, versions.
         weights_sha256: of its parameters and buffers, whatever precision they are stored in.
+        uncertainty: how its radii were measured, where it tells them: the share of poses within, on how many frames.
         pose: frame, units and order of its outputs.
     """
 
@@ -60,7 +64,14 @@ class Contract:
     preprocessing: Preprocessing
     trained: dict[str, Any]
     weights_sha256: str
+    uncertainty: dict[str, Any] | None = None
     pose: str = POSE
+
+    @property
+    def outputs(self) -> dict[str, list[str | int]]:
+        """Names and shapes of what the model says of an image, in their order."""
+        pose: dict[str, list[str | int]] = {"position_m": ["batch", 3], "quaternion_wxyz": ["batch", 4]}
+        return pose if self.uncertainty is None else pose | {name: ["batch"] for name in UNCERTAINTY}
 
     def to_json(self) -> str:
         """Write it down, with what its input looks like for those who read no code."""
@@ -73,8 +84,7 @@ class Contract:
             "range": [0, 255] if raw else [0, 1],
             "colour": "RGB",
         }
-        outputs = {"position_m": ["batch", 3], "quaternion_wxyz": ["batch", 4]}
-        return json.dumps({"contract": VERSION, **asdict(self), "input": tensor, "outputs": outputs}, indent=2)
+        return json.dumps({"contract": VERSION, **asdict(self), "input": tensor, "outputs": self.outputs}, indent=2)
 
     @classmethod
     def from_json(cls, text: str, where: str) -> Contract:
@@ -102,6 +112,7 @@ class Contract:
                 Preprocessing(short_side, (height, width), bool(preprocessing["in_model"])),
                 dict(data["trained"]),
                 str(data["weights_sha256"]),
+                None if data.get("uncertainty") is None else dict(data["uncertainty"]),
                 str(data["pose"]),
             )
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:

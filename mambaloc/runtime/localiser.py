@@ -28,11 +28,24 @@ class Localisation:
         position_m: in the scene's frame.
         quaternion: likewise.
         latency_s: seconds that preprocessing and the network took.
+        position_radius_m: the share of poses that the contract says, nine of ten, are within this; None where the
+            model does not tell.
+        rotation_radius_deg: likewise.
+        unfamiliarity: how far the image is from those that the model was trained on; over 1, hardly any frame of the
+            place is.
     """
 
     position_m: NDArray[np.float32]
     quaternion: NDArray[np.float32]
     latency_s: float
+    position_radius_m: float | None = None
+    rotation_radius_deg: float | None = None
+    unfamiliarity: float | None = None
+
+    @property
+    def is_unfamiliar(self) -> bool:
+        """Whether the image does not look like the place, so that the pose says nothing; never, where none can tell."""
+        return self.unfamiliarity is not None and not self.unfamiliarity <= 1
 
 
 class Localiser:
@@ -73,8 +86,9 @@ class Localiser:
         """
         rgb = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
         start = time.perf_counter()
-        position_m, quaternion = self._session.run(None, {self._session.get_inputs()[0].name: self._fed(rgb)})
-        return Localisation(position_m[0], quaternion[0], time.perf_counter() - start)
+        said = self._session.run(None, {self._session.get_inputs()[0].name: self._fed(rgb)})
+        taken_s, (position_m, quaternion, *uncertainty) = time.perf_counter() - start, (each[0] for each in said)
+        return Localisation(position_m, quaternion, taken_s, *map(float, uncertainty))
 
     def localise_each(self, source: str | Path) -> Iterator[tuple[float, Localisation]]:
         """Localise a source's frames one after another, each with its time in seconds since the first.
@@ -90,6 +104,9 @@ class Localiser:
 
     def _check_input(self) -> None:
         """The metadata and the graph may come from two hands."""
+        outputs = [output.name for output in self._session.get_outputs()]
+        if outputs != list(self.contract.outputs):
+            raise InputError(f"{self.path}: says {outputs}, as its contract does not; export it anew")
         told, given = self.contract.preprocessing, self._session.get_inputs()[0]
         expected = ("tensor(uint8)", [3]) if told.in_model else ("tensor(float)", [3, *told.crop])
         if (given.type, given.shape[-len(expected[1]) :]) != expected:

@@ -32,11 +32,15 @@ class Followed:
         count: of the frames.
         outliers: of them, those whose poses a filter left out.
         latency_ms: median of a frame.
+        unfamiliar: of them, those that do not look like the place; none where the model cannot tell.
+        radii: medians of what nine of ten poses are within, in metres and degrees, where the model tells.
     """
 
     count: int
     outliers: int
     latency_ms: float
+    unfamiliar: int = 0
+    radii: tuple[float, float] | None = None
 
 
 def follow(localiser: Localiser, source: str, out: Path, filtering: str | None = None) -> Followed:
@@ -74,7 +78,14 @@ def follow(localiser: Localiser, source: str, out: Path, filtering: str | None =
             write_tum(out, times, positions_m, quaternions)
     if not times:
         raise InputError(f"{source}: holds no frame; give another video")
-    return Followed(len(times), outliers, 1000 * float(np.median([pose.latency_s for pose in poses])))
+    latency_ms, unfamiliar = 1000 * _median(poses, "latency_s"), sum(pose.is_unfamiliar for pose in poses)
+    tells = localiser.contract.uncertainty is not None
+    radii = (_median(poses, "position_radius_m"), _median(poses, "rotation_radius_deg")) if tells else None
+    return Followed(len(times), outliers, latency_ms, unfamiliar, radii)
+
+
+def _median(poses: Sequence[Localisation], of: str) -> float:
+    return float(np.median([getattr(pose, of) for pose in poses]))
 
 
 def _filtered(

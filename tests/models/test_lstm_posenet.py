@@ -28,7 +28,7 @@ def test_the_four_directions_end_in_the_global_feature():
     right = last_state(network.right_and_left, matrix.mT, "")
     left = last_state(network.right_and_left, matrix.mT.flip(1), "_reverse")
     expected = torch.cat((down, up, right, left), dim=-1)
-    for feature in network.features(image):
+    for feature in network.features(network.backbone(image)):
         assert_close(feature, expected, rtol=1e-4, atol=1e-5)
 
 

@@ -118,7 +118,8 @@ def test_image_sizes(size):
     assert system.image_size == (height, width)
     prediction = system(images(3, 3, height, width))
     assert (prediction.position_m.shape, prediction.quaternion.shape) == ((3, 3), (3, 4))
-    assert [f.shape for f in system.network.features(images(3, 3, height, width))] == [(3, 16)] * 2
+    feats = system.network.backbone(images(3, 3, height, width))
+    assert [f.shape for f in system.network.features(feats)] == [(3, 16)] * 2
 
 
 def test_images_of_another_size_are_refused():
@@ -147,9 +148,10 @@ def test_branches_are_apart(branch, block):
 def test_gis_is_the_network_without_it_and_a_block_before_each_head():
     with_gis, without = small().network.eval(), small(gis="none").network.eval()
     without.load_state_dict(with_gis.state_dict(), strict=False)
-    plain = without.features(images(2, 3, 64, 64))
+    feats = without.backbone(images(2, 3, 64, 64))
+    plain = without.features(feats)
     selected = [gis(f) for gis, f in zip((with_gis.position_gis, with_gis.orientation_gis), plain, strict=True)]
-    for actual, expected in zip(with_gis.features(images(2, 3, 64, 64)), selected, strict=True):
+    for actual, expected in zip(with_gis.features(feats), selected, strict=True):
         assert_close(actual, expected, rtol=1e-5, atol=1e-7)
     prediction = with_gis(images(2, 3, 64, 64))
     assert_close(prediction.position_m, with_gis.head.position(selected[0]), rtol=1e-5, atol=1e-6)

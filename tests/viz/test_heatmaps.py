@@ -42,8 +42,8 @@ class Linear(PoseNetwork):
             self.head.position[0].weight.copy_(weight.expand(3, -1) * torch.tensor([[1.0], [0.0], [0.0]]))
             self.head.position[0].bias.zero_()
 
-    def features(self, image):
-        (feats_BCHW,) = self.backbone(image)
+    def features(self, feats):
+        (feats_BCHW,) = feats
         return (feats_BCHW.mean((-2, -1)),) * 2
 
 

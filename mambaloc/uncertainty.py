@@ -1,0 +1,208 @@
+"""How far off a pose may be, and whether its image shows the place at all: told in the pass that localises.
+
+An image is compared with training images in what the backbone sees of it as a whole. The farther the nearest one, the
+larger the error: how much larger is measured on frames held out of training, by split conformal prediction (Lei et al.
+2018, "Distribution-free predictive inference for regression", section 5.2). That promises its share of frames that come
+as the held-out ones did; another walk through the place is another draw. ``benchmark.py uncertainty`` measures this
+beside dropout, shifted crops and ensembles.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mambaloc.data import PoseDataModule
+from mambaloc.data.datamodule import Part
+from mambaloc.errors import InputError
+from mambaloc.geometry import canonical, position_error_m, rotation_error_deg
+from mambaloc.models import LitPoseRegressor
+from mambaloc.nn import PoseNetwork
+
+LEVEL = 0.9
+"""Share of poses whose errors are to be within the radii."""
+
+_FAMILIAR = 0.99  # share of held-out frames that count as of the place, once there are enough
+_REFERENCES = 256  # training frames that images are compared with
+_LEAST_SPREAD = 0.1  # of a feature, over the mean of all: one that hardly varied would count for everything
+_LEAST_INTERCEPT = 0.05  # of a radius' line, over the mean error: a training image's own pose is not exact either
+
+
+@dataclass(frozen=True)
+class ErrorsByDistance:
+    """Errors of frames, and how far their images are from the training images.
+
+    Shape:
+        (N,) each.
+    """
+
+    distance: Tensor
+    position_error_m: Tensor
+    rotation_error_deg: Tensor
+
+
+class UncertaintyHead(nn.Module):
+    """Radii of a pose, and how far its image is from what the place looks like, from what the backbone returned.
+
+    Args:
+        references: what :func:`pooled` gives of training images.
+
+    Shape:
+        (B, D) -> three of (B,): the position's radius in metres, the rotation's in degrees, and the unfamiliarity,
+        over 1 where the image is farther from the training images than :data:`_FAMILIAR` of the held-out ones.
+    """
+
+    references: Tensor
+    scale: Tensor
+    intercepts: Tensor
+    slopes: Tensor
+    familiar: Tensor
+
+    def __init__(self, references: Tensor) -> None:
+        super().__init__()
+        self.level, self.held_out_frames = math.nan, 0
+        spread = references.std(dim=0, correction=0)
+        scale = 1 / spread.clamp_min(_LEAST_SPREAD * spread.mean()).clamp_min(1e-6)
+        self.register_buffer("scale", scale)
+        self.register_buffer("references", references * scale)
+        self.register_buffer("intercepts", torch.full((2,), math.nan))
+        self.register_buffer("slopes", torch.zeros(2))
+        self.register_buffer("familiar", torch.tensor(math.nan))
+
+    def describe(self) -> dict[str, Any]:
+        """Say what the radii promise, and on how many frames they were measured."""
+        return {"level": self.level, "held_out_frames": self.held_out_frames}
+
+    def distance(self, pooled_BD: Tensor) -> Tensor:
+        """Distance to the nearest training image, (B,), each feature over its spread."""
+        apart_BMD = (pooled_BD.float() * self.scale).unsqueeze(1) - self.references
+        return apart_BMD.square().sum(dim=-1).amin(dim=1).sqrt()
+
+    def calibrate(self, held_out: ErrorsByDistance, level: float) -> None:
+        """Set the radii, a line of the distance each, and how far is unfamiliar.
+
+        Args:
+            held_out: frames that nothing was fitted to.
+            level: share of such frames that are to be within a radius.
+
+        Raises:
+            ValueError: for fewer frames than the level needs, ``level / (1 - level)``.
+        """
+        far = held_out.distance.double().numpy()
+        errors = [each.double().numpy() for each in (held_out.position_error_m, held_out.rotation_error_deg)]
+        lines = np.array([_radius_line(far, error, level) for error in errors])
+        self.level, self.held_out_frames = level, len(far)
+        self.intercepts.copy_(torch.from_numpy(lines[:, 0]))
+        self.slopes.copy_(torch.from_numpy(lines[:, 1]))
+        self.familiar.fill_(conformal_quantile(far, min(_FAMILIAR, len(far) / (len(far) + 1))))
+
+    def forward(self, pooled_BD: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tell both radii and the unfamiliarity."""
+        distance = self.distance(pooled_BD)
+        radius_B2 = self.intercepts + self.slopes * distance.unsqueeze(-1)
+        return radius_B2[:, 0], radius_B2[:, 1], distance / self.familiar
+
+
+def fit_uncertainty(system: LitPoseRegressor, data: PoseDataModule) -> UncertaintyHead:
+    """Measure how a system's errors grow with the distance to the training images, on its validation frames.
+
+    Args:
+        system: trained; left as it was.
+        data: what it was trained with.
+
+    Raises:
+        InputError: where too few frames were held out to tell, or they cannot be read.
+    """
+    check_held_out(system, data)
+    network = copy.deepcopy(system.network).cpu().float().eval()
+    head = UncertaintyHead(seen_of(network, data.centred_images("train", _REFERENCES)))
+    head.calibrate(errors_by_distance(network, head, data, "val"), LEVEL)
+    return head
+
+
+def check_held_out(system: LitPoseRegressor, data: PoseDataModule) -> None:
+    """Set the data up, and see that enough frames were held out of a system's training to tell its errors.
+
+    Raises:
+        InputError: where they were not, or cannot be read.
+    """
+    validation = data.hparams["validation"]
+    if validation in ("none", "test_set"):
+        raise InputError(f"data.validation {validation}: how sure a pose is needs held-out frames; train with auto")
+    data.setup("fit")
+    trained_on = system.provenance.get("data", {}).get("fingerprints", {}).get("train")
+    if trained_on not in (None, data.describe()["fingerprints"]["train"]):
+        raise InputError(
+            f"{data.folder}: the system was trained on other frames, so that none is known to be held out; give those"
+        )
+    count, needed = len(data.frames("val")), math.ceil(LEVEL / (1 - LEVEL) - 1e-9)
+    if count < needed:
+        raise InputError(f"data.validation {validation}: {count} frames held out, {needed} tell how sure a pose is")
+
+
+@torch.inference_mode()
+def errors_by_distance(
+    network: PoseNetwork, head: UncertaintyHead, data: PoseDataModule, part: Part
+) -> ErrorsByDistance:
+    """Localise the centre crops of a part's frames.
+
+    Args:
+        network: in evaluation mode, on the CPU.
+        head: made of training images of that network.
+        data: set up for the part.
+        part: ``val`` or ``test``.
+    """
+    distances, positions_m, quaternions = [], [], []
+    for image in data.centred_images(part):
+        feats = network.backbone(image)
+        prediction = network.head(*network.features(feats))
+        distances.append(head.distance(pooled(feats)))
+        positions_m.append(prediction.position_m)
+        quaternions.append(prediction.quaternion)
+    frames = data.frames(part)
+    true_m, true_q = (torch.from_numpy(each).float() for each in (frames.position_m, frames.quaternion))
+    return ErrorsByDistance(
+        torch.cat(distances),
+        position_error_m(torch.cat(positions_m), true_m),
+        rotation_error_deg(canonical(torch.cat(quaternions)), true_q),
+    )
+
+
+@torch.inference_mode()
+def seen_of(network: PoseNetwork, images: Iterable[Tensor]) -> Tensor:
+    """What a network's backbone sees of images as wholes; batches of (B, 3, H, W) in 0..1 -> (N, D)."""
+    return torch.cat([pooled(network.backbone(image)) for image in images])
+
+
+def pooled(feats: Tensor | list[Tensor]) -> Tensor:
+    """What a backbone sees of an image as a whole: its feature, or the means of its maps side by side; (B, D)."""
+    return feats if isinstance(feats, Tensor) else torch.cat([each.mean((-2, -1)) for each in feats], dim=-1)
+
+
+def conformal_quantile(values: NDArray[np.float64], level: float) -> float:
+    """The smallest of ``values`` that another value like them exceeds with a chance of at most ``1 - level``.
+
+    Raises:
+        ValueError: for too few values for that level.
+    """
+    rank = math.ceil((len(values) + 1) * level - 1e-9)
+    if rank > len(values):
+        raise ValueError(f"{len(values)} values tell no {level:.0%} quantile")
+    return float(np.sort(values)[rank - 1])
+
+
+def _radius_line(distance: NDArray[np.float64], error: NDArray[np.float64], level: float) -> tuple[float, float]:
+    """Intercept and slope: the errors' least-squares line, which never falls, times what lets it hold its share."""
+    slope = np.cov(distance, error)[0, 1] / max(distance.var(ddof=1), 1e-12)
+    slope = np.clip(slope, 0, (1 - _LEAST_INTERCEPT) * error.mean() / max(distance.mean(), 1e-12))
+    intercept = error.mean() - slope * distance.mean()
+    held = conformal_quantile(error / np.maximum(intercept + slope * distance, 1e-12), level)
+    return held * intercept, held * slope
