@@ -104,10 +104,14 @@ class UncertaintyHead(nn.Module):
         self.slopes.copy_(torch.from_numpy(lines[:, 1]))
         self.familiar.fill_(conformal_quantile(far, min(_FAMILIAR, len(far) / (len(far) + 1))))
 
+    def radii(self, distance: Tensor) -> Tensor:
+        """The position's radius in metres and the rotation's in degrees at each distance; (B,) -> (B, 2)."""
+        return self.intercepts + self.slopes * distance.unsqueeze(-1)
+
     def forward(self, pooled_BD: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Tell both radii and the unfamiliarity."""
         distance = self.distance(pooled_BD)
-        radius_B2 = self.intercepts + self.slopes * distance.unsqueeze(-1)
+        radius_B2 = self.radii(distance)
         return radius_B2[:, 0], radius_B2[:, 1], distance / self.familiar
 
 
@@ -121,27 +125,32 @@ def fit_uncertainty(system: LitPoseRegressor, data: PoseDataModule) -> Uncertain
     Raises:
         InputError: where too few frames were held out to tell, or they cannot be read.
     """
-    check_held_out(system, data)
-    network = copy.deepcopy(system.network).cpu().float().eval()
-    head = UncertaintyHead(seen_of(network, data.centred_images("train", _REFERENCES)))
-    head.calibrate(errors_by_distance(network, head, data, "val"), LEVEL)
+    head, held_out = head_and_held_out(system, data)
+    head.calibrate(held_out, LEVEL)
     return head
 
 
-def check_held_out(system: LitPoseRegressor, data: PoseDataModule) -> None:
-    """Set the data up, and see that enough frames were held out of a system's training to tell its errors.
+def head_and_held_out(system: LitPoseRegressor, data: PoseDataModule) -> tuple[UncertaintyHead, ErrorsByDistance]:
+    """Make a head of training images, and measure what it is to be calibrated on.
 
-    Raises:
-        InputError: where they were not, or cannot be read.
+    The arguments and errors are those of :func:`fit_uncertainty`.
     """
+    _check_held_out(system, data)
+    network = copy.deepcopy(system.network).cpu().float().eval()
+    head = UncertaintyHead(seen_of(network, data.centred_images("train", _REFERENCES)))
+    return head, errors_by_distance(network, head, data, "val")
+
+
+def _check_held_out(system: LitPoseRegressor, data: PoseDataModule) -> None:
     validation = data.hparams["validation"]
     if validation in ("none", "test_set"):
         raise InputError(f"data.validation {validation}: how sure a pose is needs held-out frames; train with auto")
     data.setup("fit")
     trained_on = system.provenance.get("data", {}).get("fingerprints", {}).get("train")
-    if trained_on not in (None, data.describe()["fingerprints"]["train"]):
+    if trained_on != data.describe()["fingerprints"]["train"]:
         raise InputError(
-            f"{data.folder}: the system was trained on other frames, so that none is known to be held out; give those"
+            f"{data.folder}: the system was trained on other frames, or does not say on which, so that none is known "
+            "to be held out; give a checkpoint's own"
         )
     count, needed = len(data.frames("val")), math.ceil(LEVEL / (1 - LEVEL) - 1e-9)
     if count < needed:

@@ -1,4 +1,4 @@
-"""Measure: tools/benchmark.py sizes|latency|loading|speed|cpu|scenes|deployment|run|report, each with --help."""
+"""Measure: benchmark.py sizes|latency|loading|speed|cpu|scenes|deployment|uncertainty|run|report, each with --help."""
 
 import argparse
 from pathlib import Path
@@ -71,6 +71,13 @@ def _deployment(args: argparse.Namespace) -> None:
     benchmark.print_deployments(found, args.threads, _machine())
 
 
+def _uncertainty(args: argparse.Namespace) -> None:
+    found = benchmark.measure_certainty(args.checkpoints, args.elsewhere)
+    benchmark.print_certainty(found, _machine())
+    benchmark.write_certainty(found, args.out, _machine())
+    print(f"{args.out}: uncertainty.json, uncertainty.png")
+
+
 def _run(args: argparse.Namespace) -> None:
     matrix, out = read_matrix(args.matrix), args.out or Path("runs/matrices", args.matrix.stem)
     if args.dry_run:
@@ -132,6 +139,11 @@ def _parser() -> argparse.ArgumentParser:
     part.add_argument("--threads", type=thread_count, default=2)
     part.add_argument("--repetitions", type=int, default=50)
     part.set_defaults(call=_deployment)
+    part = parts.add_parser("uncertainty", help="how sure poses are, by several ways of telling; coverage, rejection")
+    part.add_argument("checkpoints", nargs="+", help="of one scene; several are also taken for an ensemble")
+    part.add_argument("--elsewhere", type=Path, help="folder of pictures of another place")
+    part.add_argument("--out", type=Path, default=Path("runs/uncertainty"), help="folder of the plot and the figures")
+    part.set_defaults(call=_uncertainty)
     part = parts.add_parser("run", help="train and evaluate a matrix of recipes, what ended before left alone")
     part.add_argument("matrix", type=Path, help="as recipes/matrices/ holds them")
     part.add_argument("--out", type=Path, help="folder of results.sqlite and runs/; runs/matrices/NAME unless given")

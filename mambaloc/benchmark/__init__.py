@@ -9,8 +9,11 @@ from mambaloc.benchmark.scenes import SceneCost, measure_scenes
 from mambaloc.benchmark.sizes import Size, size_of, size_table
 from mambaloc.benchmark.speed import Setting
 from mambaloc.benchmark.speed_report import SpeedReport, measure_all, print_report, write_report
+from mambaloc.benchmark.uncertainty import Certainty, measure_certainty
+from mambaloc.benchmark.uncertainty_report import print_certainty, write_certainty
 
 __all__ = [
+    "Certainty",
     "Deployment",
     "Latency",
     "LoadingRates",
@@ -21,11 +24,13 @@ __all__ = [
     "SpeedReport",
     "forward_flops",
     "measure_all",
+    "measure_certainty",
     "measure_cpu_settings",
     "measure_deployment",
     "measure_latency",
     "measure_loading",
     "measure_scenes",
+    "print_certainty",
     "print_cpu_settings",
     "print_deployments",
     "print_latencies",
@@ -35,5 +40,6 @@ __all__ = [
     "print_sizes",
     "size_of",
     "size_table",
+    "write_certainty",
     "write_report",
 ]

@@ -18,6 +18,7 @@ from mambaloc.models import LitPoseRegressor
 from mambaloc.models.registry import model_class
 from mambaloc.nn import MambaMixer
 from mambaloc.types import PoseBatch, PosePrediction
+from mambaloc.uncertainty import ErrorsByDistance, UncertaintyHead, seen_of
 
 # What makes a system small and quick; each takes those arguments that it has.
 SMALL = {
@@ -136,10 +137,15 @@ def test_checkpoint_round_trip(name, gis, tmp_path):
 @EACH_ONCE
 def test_onnx_runtime_agrees(name, tmp_path):
     system = small(name, "gis")
-    contract = contract_of(system, {"dataset": "7scenes", "scene": "heads", "short_side": SIDE})
-    parity = export_onnx(system, tmp_path / "model.onnx", contract, tolerance_m=1e-4, tolerance_deg=0.01)
-    assert (tmp_path / "model.onnx").is_file()
+    with torch.no_grad():
+        uncertainty = UncertaintyHead(seen_of(system.network.eval(), [frames(4).image]))
+    uncertainty.calibrate(ErrorsByDistance(*torch.rand(3, 20) + 0.1), 0.9)
+    contract = contract_of(system, {"dataset": "7scenes", "scene": "heads", "short_side": SIDE}, uncertainty)
+    path = tmp_path / "model.onnx"
+    parity = export_onnx(system, path, contract, uncertainty, tolerance_m=1e-4, tolerance_deg=0.01)
+    assert path.is_file()
     assert parity.position_m < 1e-4
+    assert parity.uncertainty < 1e-3
 
 
 @EVERY

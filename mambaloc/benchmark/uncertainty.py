@@ -1,0 +1,268 @@
+"""How well a system knows its own errors, by several ways of telling: :mod:`mambaloc.uncertainty` was chosen by it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from rich.console import Console
+from torch import Tensor, nn
+from torchmetrics.functional import spearman_corrcoef
+from torchmetrics.functional.classification import binary_auroc
+
+from mambaloc.data import PoseDataModule
+from mambaloc.data.augmentation import center_corner
+from mambaloc.errors import InputError
+from mambaloc.geometry import canonical, position_error_m, rotation_error_deg
+from mambaloc.images import PICTURES, read_image
+from mambaloc.nn import PoseNetwork
+from mambaloc.types import PosePrediction
+from mambaloc.uncertainty import (
+    ErrorsByDistance,
+    UncertaintyHead,
+    errors_by_distance,
+    head_and_held_out,
+    pooled,
+)
+from mambaloc.zoo.bundles import load_with_data
+
+LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9)
+PASSES = 8
+"""Draws of dropout."""
+REJECTED = 0.2
+"""Share of the frames, the least sure ones, that are left out."""
+
+_ByLevel = dict[float, tuple[float, float]]
+"""Of position and rotation, by share asked."""
+
+Pictures = Callable[[], Iterator[Tensor]]
+"""Batches of decoded frames, (B, 3, H, W) ``uint8``, larger than the network's crop."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way of telling how sure a pose is: larger scores for what should be wrong by more.
+
+    Shape:
+        ``position`` and ``rotation`` (N,) over the test frames, ``elsewhere`` (M,) over pictures of another place, none
+        where none were given.
+
+    Args:
+        passes: of the network, an image.
+    """
+
+    name: str
+    passes: int
+    position: Tensor
+    rotation: Tensor
+    elsewhere: Tensor
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """What was found of one checkpoint.
+
+    Args:
+        checkpoint: whose errors are told.
+        where: which system, on which scene.
+        held_out_frames: that its radii were measured on.
+        position_error_m: of each test frame, (N,).
+        rotation_error_deg: likewise.
+        coverage: shares of test frames within both radii, for each of :data:`LEVELS`.
+        radii: medians of both radii over the test frames, likewise.
+        unfamiliarity: of the test frames, (N,).
+        unfamiliarity_elsewhere: of pictures of another place, (M,); none where none were given.
+        ways: of telling; the first is the exported one.
+    """
+
+    checkpoint: str
+    where: str
+    held_out_frames: int
+    position_error_m: Tensor
+    rotation_error_deg: Tensor
+    coverage: _ByLevel
+    radii: _ByLevel
+    unfamiliarity: Tensor
+    unfamiliarity_elsewhere: Tensor
+    ways: list[Way]
+
+
+def measure_certainty(checkpoints: Sequence[str], elsewhere: Path | None = None) -> list[Certainty]:
+    """Compare ways of telling how sure a pose is, on the test frames of trained systems.
+
+    Args:
+        checkpoints: of one scene; several are also taken for an ensemble.
+        elsewhere: folder of pictures of another place.
+
+    Raises:
+        InputError: for a bad checkpoint, too few frames held out, or pictures that cannot be read.
+    """
+    systems = [load_with_data(checkpoint) for checkpoint in checkpoints]
+    networks = [copy.deepcopy(system.network).cpu().float().eval() for system, _ in systems]
+    found = []
+    for (system, data), network, checkpoint in zip(systems, networks, checkpoints, strict=True):
+        with Console(stderr=True).status(f"measuring {checkpoint}"):
+            head, held_out = head_and_held_out(system, data)
+            data.setup("test")
+            test = errors_by_distance(network, head, data, "test")
+            there = _no_pictures if elsewhere is None else _pictures_of(elsewhere, data)
+            coverage, radii = _covered(head, held_out, test)
+            far = _distances(network, head, data.crop, there)
+            by_spread = _by_spread(network, networks, data.crop, _test_frames(data), there)
+        found.append(
+            Certainty(
+                checkpoint,
+                f"{system.registry_name} on {data.hparams['dataset']}/{data.hparams['scene']}, test",
+                len(held_out.distance),
+                test.position_error_m,
+                test.rotation_error_deg,
+                coverage,
+                radii,
+                test.distance / head.familiar,
+                far / head.familiar,
+                [Way("training images", 1, test.distance, test.distance, far), *by_spread],
+            )
+        )
+    return found
+
+
+def _covered(head: UncertaintyHead, held_out: ErrorsByDistance, test: ErrorsByDistance) -> tuple[_ByLevel, _ByLevel]:
+    """Shares of test frames within the radii, and the radii's medians; the head is left at the last level."""
+    errors_N2 = torch.stack((test.position_error_m, test.rotation_error_deg), dim=-1)
+    coverage, medians = {}, {}
+    for level in LEVELS:
+        head.calibrate(held_out, level)
+        radii_N2 = head.radii(test.distance)
+        position, rotation = (errors_N2 <= radii_N2).double().mean(dim=0).tolist()
+        coverage[level] = (position, rotation)
+        metres, degrees = radii_N2.quantile(0.5, dim=0).tolist()
+        medians[level] = (metres, degrees)
+    return coverage, medians
+
+
+def rank_correlation(score: Tensor, error: Tensor) -> float:
+    """Spearman's: 1 where frames are as wrong, in order, as they are unsure."""
+    return spearman_corrcoef(score.double(), error.double()).item()
+
+
+def change_by_rejection(score: Tensor, error: Tensor, rejected: float = REJECTED) -> float:
+    """What leaving out the least sure frames changes the median error by, over it; negative where it helps."""
+    return (median_of_surest(score, error, 1 - rejected) / error.double().quantile(0.5) - 1).item()
+
+
+def median_of_surest(score: Tensor, error: Tensor, share: float) -> Tensor:
+    """Median error of the surest frames, so large a share of all."""
+    kept = score.argsort(stable=True)[: max(1, round(share * len(error)))]
+    return error[kept].double().quantile(0.5)
+
+
+def told_apart(score: Tensor, elsewhere: Tensor) -> float:
+    """Area under the ROC curve: the chance that a picture of another place scores higher than a test frame."""
+    scores, of_elsewhere = (
+        torch.cat((score, elsewhere)),
+        torch.cat((torch.zeros(len(score)), torch.ones(len(elsewhere)))),
+    )
+    ranks = scores.unique(return_inverse=True)[1].double()  # what is no probability would be squashed to one
+    return binary_auroc(ranks / ranks.max().clamp_min(1), of_elsewhere.long()).item()
+
+
+def _by_spread(
+    network: PoseNetwork, networks: list[PoseNetwork], size: tuple[int, int], test: Pictures, there: Pictures
+) -> list[Way]:
+    """Ways that localise an image several times, and take how far apart the poses are."""
+    told: dict[str, tuple[int, Callable[[Tensor], list[PosePrediction]]]] = {
+        "dropout": (PASSES, lambda image: _dropped_out(network, _centre(image, size))),
+        "shifted crops": (5, lambda image: [network(each) for each in _crops(image, size)]),
+    }
+    if len(networks) > 1:
+        told[f"ensemble of {len(networks)}"] = (len(networks), lambda i: [each(_centre(i, size)) for each in networks])
+    ways = []
+    for name, (passes, poses) in told.items():
+        ways.append(Way(name, passes, *_spreads(poses, test), _spreads(poses, there)[0]))
+    return ways
+
+
+@torch.inference_mode()
+def _spreads(poses: Callable[[Tensor], list[PosePrediction]], pictures: Pictures) -> tuple[Tensor, Tensor]:
+    spreads = [pose_spread(poses(image)) for image in pictures()]
+    positions, rotations = zip(*spreads, strict=True) if spreads else ((torch.zeros(0),), (torch.zeros(0),))
+    return torch.cat(positions), torch.cat(rotations)
+
+
+def pose_spread(poses: list[PosePrediction]) -> tuple[Tensor, Tensor]:
+    """Root mean square distances of K poses to their mean, in metres and degrees; (B,) each."""
+    positions_KB3 = torch.stack([each.position_m for each in poses])
+    quaternions_KB4 = torch.stack([canonical(each.quaternion) for each in poses])
+    sign_KB1 = torch.where((quaternions_KB4 * quaternions_KB4[:1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    mean_m, mean_q = positions_KB3.mean(0), canonical((sign_KB1 * quaternions_KB4).mean(0))
+    apart_m = position_error_m(positions_KB3, mean_m.expand_as(positions_KB3))
+    apart_deg = rotation_error_deg(quaternions_KB4, mean_q.expand_as(quaternions_KB4))
+    return apart_m.square().mean(0).sqrt(), apart_deg.square().mean(0).sqrt()
+
+
+def _dropped_out(network: PoseNetwork, image: Tensor) -> list[PosePrediction]:
+    """Poses with dropout as in training (Gal and Ghahramani 2016), the same draws for every batch."""
+    drops = [module for module in network.modules() if isinstance(module, nn.Dropout)]
+    try:
+        for module in drops:
+            module.train()
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            return [network(image) for _ in range(PASSES)]
+    finally:
+        network.eval()
+
+
+def _centre(image: Tensor, size: tuple[int, int]) -> Tensor:
+    top, left = center_corner(image, size)
+    return _cut(image, size, top, left)
+
+
+def _crops(image: Tensor, size: tuple[int, int]) -> list[Tensor]:
+    """The middle and the four corners."""
+    bottom, right = image.shape[-2] - size[0], image.shape[-1] - size[1]
+    corners = [_cut(image, size, top, left) for top in (0, bottom) for left in (0, right)]
+    return [_centre(image, size), *corners]
+
+
+def _cut(image: Tensor, size: tuple[int, int], top: int, left: int) -> Tensor:
+    return image[..., top : top + size[0], left : left + size[1]].float() / 255
+
+
+@torch.inference_mode()
+def _distances(network: PoseNetwork, head: UncertaintyHead, size: tuple[int, int], pictures: Pictures) -> Tensor:
+    distances = [head.distance(pooled(network.backbone(_centre(image, size)))) for image in pictures()]
+    return torch.cat(distances) if distances else torch.zeros(0)
+
+
+def _no_pictures() -> Iterator[Tensor]:
+    return iter(())
+
+
+def _test_frames(data: PoseDataModule) -> Pictures:
+    return lambda: (batch.image for batch in data.test_dataloader())
+
+
+def _pictures_of(folder: Path, data: PoseDataModule) -> Pictures:
+    """Pictures of another place, their middle cut to the shape of the scene's frames."""
+    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in PICTURES)
+    if not paths:
+        raise InputError(f"--elsewhere {folder}: holds no {', '.join(PICTURES)}; give a folder of pictures")
+    height, width = next(_test_frames(data)()).shape[-2:]
+
+    def read() -> Iterator[Tensor]:
+        for path in paths:
+            rgb = read_image(path)
+            scale = min(rgb.shape[0] / height, rgb.shape[1] / width)
+            rows, columns = round(height * scale), round(width * scale)
+            top, left = (rgb.shape[0] - rows) // 2, (rgb.shape[1] - columns) // 2
+            middle = np.ascontiguousarray(rgb[top : top + rows, left : left + columns])
+            shaped = cv2.resize(middle, (width, height), interpolation=cv2.INTER_AREA)
+            yield torch.from_numpy(shaped.transpose(2, 0, 1).copy())[None]
+
+    return read
