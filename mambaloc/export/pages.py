@@ -61,10 +61,25 @@ Camera pose of one RGB image, {contract.pose}.
 `python tools/verify_bundle.py FOLDER` checks it, `python tools/demo.py FOLDER` shows it in a browser. An app ships a
 model and `contract.json`; `frames/` are for checking a port.
 
+## How sure it is
+
+{_uncertainty(contract)}
+
 ## Trained
 
 {trained}
 """
+
+
+def _uncertainty(contract: Contract) -> str:
+    told = contract.uncertainty
+    if told is None:
+        return "The models do not tell: no frames were held out of their training to measure it on."
+    return (
+        f"Beside the pose the models say `position_radius_m` and `rotation_radius_deg`: {told['level']:.0%} of the "
+        f"{told['held_out_frames']} frames that were held out of training are within these of their true poses. "
+        "`unfamiliarity` over 1 means that the picture hardly looks like the place: do not use its pose."
+    )
 
 
 def _in_words(value: Any) -> str:

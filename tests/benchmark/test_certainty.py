@@ -36,7 +36,7 @@ def test_rejection_by_hand():
 
 def test_spreads_by_hand():
     """Two poses 6 m and 20 degrees apart are 3 m and 10 degrees from their mean, whatever the quaternions' signs."""
-    turns = Rotation.from_euler("z", [170, 190], degrees=True).as_quat()[:, [3, 0, 1, 2]]
+    turns = Rotation.from_euler("z", [[170], [190]], degrees=True).as_quat()[:, [3, 0, 1, 2]]
     poses = [
         PosePrediction(torch.tensor([[x, 1.0, 1.0]]), canonical(torch.from_numpy(turn[None]).float()))
         for x, turn in zip((0.0, 6.0), turns, strict=True)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from mambaloc.demo import build_site
+from mambaloc.export import write_bundle
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.bundle import rotation_deg
+from mambaloc.zoo.bundles import EMBEDDED, load_with_data
 
 pytestmark = pytest.mark.slow
 
@@ -67,6 +69,32 @@ def test_a_bundle_that_takes_pictures_as_they_are(opened, raw_bundle, tmp_path, 
         page = opened("frames", f"http://127.0.0.1:{server.server_port}/")
         page.click('[data-frame-file="frames/1.png"]')
         check(pose_of(page), Localiser(raw_bundle).localise(raw_bundle / "frames/1.png"))
+
+
+def test_how_sure_a_model_is(opened, tmp_path, served):
+    system, data = load_with_data(EMBEDDED)
+    data.setup("fit")
+    system.provenance = {**system.provenance, "data": data.describe()}  # as if it had been trained on these frames
+    write_bundle(system, data, tmp_path / "bundle", ("onnx",), "web")
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.png"), noise)
+    localiser = Localiser(tmp_path / "bundle")
+    with served(build_site(tmp_path / "bundle", tmp_path / "site")) as server:
+        page = opened("photo", f"http://127.0.0.1:{server.server_port}/")
+        for count, path in enumerate((tmp_path / "bundle/frames/3.png", tmp_path / "noise.png"), start=1):
+            page.set_input_files("#photo", path)
+            check(pose_of(page, count), found := localiser.localise(path))
+            radii = [page.text_content(f'[data-show="radius-{of}"]') for of in ("position", "rotation")]
+            assert radii == [f"±{found.position_radius_m:.2f} m", f"±{found.rotation_radius_deg:.1f}°"]
+            assert page.get_attribute("#uncertainty", "data-within") == str(not found.is_unfamiliar).lower()
+            assert page.is_visible("#uncertainty")
+
+
+def test_a_model_that_does_not_tell_how_sure_it_is(opened):
+    page = opened("frames")
+    page.click('[data-frame-file="frames/1.png"]')
+    pose_of(page)
+    assert not page.is_visible("#uncertainty")
 
 
 def test_the_page_checks_the_bundle_by_itself(opened):

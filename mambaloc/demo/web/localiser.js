@@ -7,6 +7,7 @@
 
 const CONTRACT_VERSION = 1;
 const MODELS = ["model.onnx", "model.fp16.onnx", "model.int8.onnx", "model.ort"];
+const UNCERTAINTY = ["position_radius_m", "rotation_radius_deg", "unfamiliarity"];
 const IN_UNIT = Float32Array.from({ length: 256 }, (_, value) => value / 255);
 
 /** A model on ONNX Runtime. */
@@ -37,7 +38,8 @@ export class Localiser {
   /**
    * Localise one picture.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
-   * @returns `world_from_cam`: the camera centre in metres, a unit quaternion wxyz, and what it took.
+   * @returns `world_from_cam`: the camera centre in metres, a unit quaternion wxyz, and what it took; where the model
+   *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for a picture of elsewhere.
    */
   async localise(image) {
     const start = performance.now();
@@ -49,7 +51,9 @@ export class Localiser {
     if (![...position_m, ...quaternion_wxyz].every(Number.isFinite)) {
       throw new Error("The network answered with numbers that are not finite; choose the other backend.");
     }
-    return { position_m, quaternion_wxyz, preprocess_ms: fed - start, network_ms: performance.now() - fed };
+    const told = UNCERTAINTY.filter((name) => name in found).map((name) => [name, Number(found[name].data[0])]);
+    const took = { preprocess_ms: fed - start, network_ms: performance.now() - fed };
+    return { position_m, quaternion_wxyz, ...Object.fromEntries(told), ...took };
   }
 
   #tensor(image) {

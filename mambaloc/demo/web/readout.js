@@ -64,8 +64,20 @@ export class Readout {
       const held = attitude(quaternion_wxyz, this.up);
       for (const name of ["heading", "pitch", "roll"]) shown(name).textContent = signed(held[name], 1);
     }
+    this.#showUncertainty(pose);
     this.#showSpeed(pose, file || source === "photo");
     data.frame = String((this.#count += 1)); // last: who waits for it finds the rest in place
+  }
+
+  /** Show what most poses are within, where the model tells, and whether the picture is of the place at all. */
+  #showUncertainty({ position_radius_m, rotation_radius_deg, unfamiliarity }) {
+    const row = document.getElementById("uncertainty");
+    row.hidden = unfamiliarity === undefined;
+    if (row.hidden) return;
+    row.dataset.within = String(unfamiliarity <= 1);
+    shown("radius-position").textContent = `±${position_radius_m.toFixed(2)} m`;
+    shown("radius-rotation").textContent = `±${rotation_radius_deg.toFixed(1)}°`;
+    shown("uncertainty-detail").textContent = unfamiliarity > 1 ? "does not look like the place" : "";
   }
 
   /** Show how far the film's camera is from its true pose, and the median of the run so far. */
