@@ -11,7 +11,7 @@ torch.set_num_threads(1)
 def step():
     first, second = (torch.ones(2**22) for _ in range(2))  # 16 MiB each
     del first, second
-for _ in range(3):
+for _ in range(12):  # until the heap has found its size, which takes some steps more or fewer by where it starts
     step()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 for _ in range(20):

@@ -1,4 +1,4 @@
-"""Measure: benchmark.py sizes|latency|loading|speed|cpu|scenes|deployment|uncertainty|run|report, each with --help."""
+"""Measure: tools/benchmark.py PART, where PART is one of those that --help lists; each has a --help of its own."""
 
 import argparse
 from pathlib import Path
@@ -78,6 +78,13 @@ def _uncertainty(args: argparse.Namespace) -> None:
     print(f"{args.out}: uncertainty.json, uncertainty.png")
 
 
+def _soak(args: argparse.Namespace) -> None:
+    samples = benchmark.measure_soak(args.recipes, args.steps, args.out)
+    benchmark.print_soak(samples, _machine())
+    benchmark.draw_soak(samples, args.out / "soak.png", f"{args.recipes[0].stem}, {args.steps} steps")
+    print(f"{args.out}: soak.png, samples.jsonl, train.log, run/")
+
+
 def _run(args: argparse.Namespace) -> None:
     matrix, out = read_matrix(args.matrix), args.out or Path("runs/matrices", args.matrix.stem)
     if args.dry_run:
@@ -144,6 +151,11 @@ def _parser() -> argparse.ArgumentParser:
     part.add_argument("--elsewhere", type=Path, help="folder of pictures of another place")
     part.add_argument("--out", type=Path, default=Path("runs/uncertainty"), help="folder of the plot and the figures")
     part.set_defaults(call=_uncertainty)
+    part = parts.add_parser("soak", help="memory, open files and threads over a long training")
+    part.add_argument("recipes", type=Path, nargs="+", help="a recipe, and overlays")
+    part.add_argument("--steps", type=int, default=10_000)
+    part.add_argument("--out", type=Path, default=Path("runs/soak"), help="folder that is not there yet")
+    part.set_defaults(call=_soak)
     part = parts.add_parser("run", help="train and evaluate a matrix of recipes, what ended before left alone")
     part.add_argument("matrix", type=Path, help="as recipes/matrices/ holds them")
     part.add_argument("--out", type=Path, help="folder of results.sqlite and runs/; runs/matrices/NAME unless given")

@@ -7,6 +7,7 @@ from mambaloc.benchmark.loading import LoadingRates, measure_loading
 from mambaloc.benchmark.report import print_deployments, print_latencies, print_loading, print_scenes, print_sizes
 from mambaloc.benchmark.scenes import SceneCost, measure_scenes
 from mambaloc.benchmark.sizes import Size, size_of, size_table
+from mambaloc.benchmark.soak import Sample, draw_soak, measure_soak, print_soak
 from mambaloc.benchmark.speed import Setting
 from mambaloc.benchmark.speed_report import SpeedReport, measure_all, print_report, write_report
 from mambaloc.benchmark.uncertainty import Certainty, measure_certainty
@@ -17,11 +18,13 @@ __all__ = [
     "Deployment",
     "Latency",
     "LoadingRates",
+    "Sample",
     "SceneCost",
     "Setting",
     "SettingTimes",
     "Size",
     "SpeedReport",
+    "draw_soak",
     "forward_flops",
     "measure_all",
     "measure_certainty",
@@ -30,6 +33,7 @@ __all__ = [
     "measure_latency",
     "measure_loading",
     "measure_scenes",
+    "measure_soak",
     "print_certainty",
     "print_cpu_settings",
     "print_deployments",
@@ -38,6 +42,7 @@ __all__ = [
     "print_report",
     "print_scenes",
     "print_sizes",
+    "print_soak",
     "size_of",
     "size_table",
     "write_certainty",

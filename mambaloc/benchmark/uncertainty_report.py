@@ -36,7 +36,7 @@ _ERRORS = ("position", "rotation")
 def print_certainty(found: Sequence[Certainty], machine: str) -> None:
     """Print how the ways compare, and what the radii hold; means over the checkpoints."""
     console = Console(highlight=False)
-    columns = ("passes", "rank corr. m", "°", f"median m, {REJECTED:.0%} rejected", "°", "told apart")
+    columns = ("passes", "rank m", "rank °", "median m", "median °", "told apart")
     table = new_table("How sure a pose is", "told by", *columns)
     for name, figures in compared(found).items():
         changes = (f"{figures[f'{of}_change']:+.1%}" for of in _ERRORS)
@@ -45,6 +45,9 @@ def print_certainty(found: Sequence[Certainty], machine: str) -> None:
         (metres, degrees), (rank_m, rank_deg) = changes, ranks
         table.add_row(name, str(figures["passes"]), rank_m, rank_deg, metres, degrees, apart)
     console.print(table)
+    explained = "rank: correlation of scores' ranks with errors'"
+    rejected = f"median: what leaving out the {REJECTED:.0%} least sure frames changes it by"
+    console.print(f"{explained}; {rejected}; told apart: area under the ROC curve", soft_wrap=True)
     table = new_table("Test frames within the radii", "asked", "position", "rotation", "radius m", "°")
     for level in LEVELS:
         shares, radii = (np.mean([of[level] for of in told], axis=0) for told in _told(found))
@@ -147,7 +150,7 @@ def _draw_familiarity(axes: Axes, found: Sequence[Certainty]) -> None:
         )
     axes.axvline(1, color="#374151", linewidth=1, linestyle="--")
     axes.set(xlabel="unfamiliarity (flagged right of the dashed line)", ylabel="share of pictures")
-    axes.legend(frameon=False, loc="upper right")
+    axes.legend(frameon=False, loc="upper left")
 
 
 def _draw_sparsification(axes: Axes, found: Sequence[Certainty], of: str) -> None:

@@ -1,0 +1,160 @@
+"""Whether a long training stays as it began: memory, open files and threads, sampled while a recipe trains."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from mambaloc.benchmark.report import new_table
+from mambaloc.errors import InputError
+from mambaloc.files import writing
+from mambaloc.viz.trajectory import write_png
+
+_SELF = Path("/proc/self")
+_SAMPLES = 200
+_WARM_UP = 0.2  # of the steps: allocators and caches fill, first validation and first checkpoint
+_TRAIN = "from mambaloc.cli import main; main()"
+
+SHOWN = {
+    "private_mib": "memory of its own (MiB)",
+    "device_mib": "memory on the GPU (MiB)",
+    "files": "open files",
+    "threads": "threads",
+}
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a training process held after a step.
+
+    Args:
+        step: of the optimiser.
+        seconds: since the first step.
+        private_mib: resident memory without mapped files, as the cache of frames.
+        device_mib: memory that tensors take on a GPU; 0 without one.
+        files: open file handles.
+        threads: of the process.
+    """
+
+    step: int
+    seconds: float
+    private_mib: float
+    device_mib: float
+    files: int
+    threads: int
+
+
+class ResourceWatch(L.Callback):
+    """Write a :class:`Sample` now and then, a JSON object a line.
+
+    Args:
+        out: the file.
+        every_n_steps: how often.
+    """
+
+    def __init__(self, out: str, every_n_steps: int) -> None:
+        self.out, self.every_n_steps = Path(out), every_n_steps
+        self._started_at = 0.0
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """Sample, where this step's turn has come."""
+        self._started_at = self._started_at or time.monotonic()
+        if trainer.global_step % self.every_n_steps:
+            return
+        status = dict(line.split(":", 1) for line in (_SELF / "status").read_text(encoding="utf-8").splitlines())
+        device = torch.cuda.memory_allocated() if torch.cuda.is_available() else 0
+        sample = Sample(
+            trainer.global_step,
+            round(time.monotonic() - self._started_at, 3),
+            int(status["RssAnon"].split()[0]) / 1024,
+            device / 2**20,
+            len(list((_SELF / "fd").iterdir())),
+            int(status["Threads"]),
+        )
+        with self.out.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(asdict(sample)) + "\n")
+
+
+def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]:
+    """Train a recipe for so many steps, as ``tools/train.py`` does, in a process of its own.
+
+    Args:
+        recipes: a recipe and overlays; the last of its epochs, and early stopping, are put off.
+        steps: of the optimiser.
+        out: the run's folder, which must not be there yet.
+
+    Raises:
+        InputError: where there is no recipe or no ``/proc``, the folder is there, or the training fails.
+    """
+    if not (_SELF / "status").is_file():
+        raise InputError("soak: open files and threads are counted in /proc, which only Linux has; run it there")
+    if missing := next((recipe for recipe in recipes if not recipe.is_file()), None):
+        raise InputError(f"{missing}: no such recipe; give one of recipes/")
+    if out.exists():
+        raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
+    with writing(out):
+        out.mkdir(parents=True)
+    samples, log = out / "samples.jsonl", out / "train.log"
+    watch = "--trainer.callbacks"
+    command = [
+        *(sys.executable, "-c", _TRAIN, *map(str, recipes), "--trainer.default_root_dir", str(out / "run")),
+        *("--trainer.max_epochs", "-1", "--trainer.max_steps", str(steps), "--early_stopping.patience", "0"),
+        *(f"{watch}+=mambaloc.benchmark.soak.ResourceWatch", f"{watch}.out={samples}"),
+        f"{watch}.every_n_steps={max(1, steps // _SAMPLES)}",
+    ]
+    with Console(stderr=True).status(f"training {steps} steps"), log.open("w", encoding="utf-8") as said:
+        ended = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, check=False)
+    if ended.returncode:
+        last = (log.read_text(encoding="utf-8").strip().splitlines() or ["it said nothing"])[-1]
+        raise InputError(f"{recipes[0]}: its training ended with {ended.returncode} ({last}); see {log}")
+    return [Sample(**json.loads(line)) for line in samples.read_text(encoding="utf-8").splitlines()]
+
+
+def growth(samples: list[Sample], of: str) -> tuple[float, float]:
+    """What a quantity began at after the warm-up, and what a straight line through it adds in 1000 steps."""
+    kept = [sample for sample in samples if sample.step > _WARM_UP * samples[-1].step]
+    values = np.array([getattr(sample, of) for sample in kept], dtype=float)
+    slope, _ = np.polyfit([sample.step for sample in kept], values, 1)
+    return float(np.median(values[: max(1, len(values) // 10)])), 1000 * float(slope)
+
+
+def print_soak(samples: list[Sample], machine: str) -> None:
+    """Print a row a quantity: after the warm-up, growth, largest."""
+    table = new_table("A long training", "", "begins at", "per 1000 steps", "ends at", "largest")
+    for of, name in SHOWN.items():
+        if not any(getattr(sample, of) for sample in samples):
+            continue
+        start, slope = growth(samples, of)
+        largest = max(getattr(sample, of) for sample in samples)
+        table.add_row(name, f"{start:.1f}", f"{slope:+.3f}", f"{getattr(samples[-1], of):.1f}", f"{largest:.1f}")
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(f"{samples[-1].step} steps in {samples[-1].seconds:.0f} s; {machine}", soft_wrap=True)
+
+
+def draw_soak(samples: list[Sample], path: Path, title: str) -> None:
+    """Draw each quantity over the steps."""
+    shown = [of for of in SHOWN if any(getattr(sample, of) for sample in samples)]
+    figure = Figure(figsize=(8, 2.2 * len(shown)), layout="constrained")
+    for axes, of in zip(figure.subplots(len(shown), 1, sharex=True), shown, strict=True):
+        axes.plot([sample.step for sample in samples], [getattr(sample, of) for sample in samples], color="#1d4ed8")
+        axes.set_ylabel(SHOWN[of].replace(" (", "\n("), fontsize=9)
+        axes.set_ylim(bottom=0)
+        axes.grid(color="#e5e7eb", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    axes.set_xlabel("step")
+    figure.suptitle(title, fontsize=11)
+    with writing(path):
+        write_png(figure, path)

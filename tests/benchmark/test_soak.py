@@ -1,0 +1,57 @@
+"""Long trainings: growth is found where there is some, and a short one is watched from its first step to its last."""
+
+import sys
+
+import cv2
+import pytest
+
+from mambaloc.benchmark import Sample, draw_soak, measure_soak, print_soak
+from mambaloc.benchmark.soak import growth
+from mambaloc.errors import InputError
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="counts in /proc")
+
+
+def sample(step, **changed):
+    return Sample(
+        **{"step": step, "seconds": step / 10, "private_mib": 500, "device_mib": 0, "files": 9, "threads": 4, **changed}
+    )
+
+
+def test_a_leak_is_found():
+    """After a warm-up that takes 300 MiB, 2 MiB and one file are lost every hundred steps."""
+    samples = [
+        sample(step, private_mib=500 + 300 * min(1, step / 150) + step / 50, files=9 + step // 100)
+        for step in range(10, 1001, 10)
+    ]
+    start, slope = growth(samples, "private_mib")
+    assert start == pytest.approx(804 + 0.6, abs=1)
+    assert slope == pytest.approx(20)
+    assert growth(samples, "files")[1] == pytest.approx(10, rel=0.05)
+    assert growth(samples, "threads") == (4, pytest.approx(0, abs=1e-9))
+
+
+@pytest.mark.slow
+def test_a_training_is_watched(tiny_recipe, tmp_path, capsys):
+    out = tmp_path / "soak"
+    samples = measure_soak([tiny_recipe], 40, out)
+    assert [each.step for each in samples] == list(range(1, 41))
+    assert all(each.private_mib > 50 and each.files > 2 and each.threads > 0 for each in samples)
+    assert (out / "run/checkpoints/last.ckpt").is_file()
+    print_soak(samples, "a machine")
+    said = capsys.readouterr().out
+    assert "open files" in said
+    assert "GPU" not in said
+    draw_soak(samples, out / "soak.png", "tiny, 40 steps")
+    assert cv2.imread(str(out / "soak.png")) is not None
+    with pytest.raises(InputError, match="soak: is there already; choose another folder with --out"):
+        measure_soak([tiny_recipe], 40, out)
+
+
+def test_wrong_uses(tmp_path, tiny_recipe):
+    with pytest.raises(InputError, match=r"none\.yaml: no such recipe"):
+        measure_soak([tmp_path / "none.yaml"], 40, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    tiny_recipe.write_text("model: [")
+    with pytest.raises(InputError, match=r"tiny\.yaml: its training ended with 2 \(.*tiny\.yaml.*\); see .*train\.log"):
+        measure_soak([tiny_recipe], 40, tmp_path / "out")
