@@ -131,7 +131,7 @@ def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
         partial.replace(folder)
     except OSError as error:
         file = Path(error.filename) if isinstance(error.filename, str) else folder
-        where = folder if partial is not None and file.is_relative_to(partial) else file
+        where = folder if partial is None or file.is_relative_to(partial) else file
         raise InputError(f"{where}: {error.strerror or error}; {remedy}") from None
     finally:
         if partial is not None:

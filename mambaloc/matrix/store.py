@@ -71,6 +71,8 @@ class Store:
                 self._database.execute(_TABLE)
         except OSError as error:
             raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
+        except sqlite3.OperationalError as error:
+            raise InputError(f"{self.path}: cannot be written ({error}); choose another --out") from None
         except sqlite3.Error as error:
             raise InputError(f"{self.path}: is no store of results ({error}); choose another --out") from None
 
