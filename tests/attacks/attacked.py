@@ -16,7 +16,8 @@ from subjects import Subject
 from mambaloc.console import exits_cleanly, quieten
 
 SERVER = multiprocessing.get_context("forkserver")
-SERVER.set_forkserver_preload(["subjects"])
+# Not the subjects themselves: before Python 3.12.8 the server knows nothing of pytest's paths, and does not say so.
+SERVER.set_forkserver_preload(["mambaloc.cli", "mambaloc.importing.importer", "mambaloc.matrix", "mambaloc.zoo"])
 
 
 def audited(below: Path, deed) -> None:
