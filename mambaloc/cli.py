@@ -18,13 +18,20 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 
-from mambaloc.callbacks import EarlyStopping, OnnxExport, PoseProgressBar, TrajectoryPlot, WallClock
+from mambaloc.callbacks import (
+    EarlyStopping,
+    OnnxExport,
+    PoseProgressBar,
+    TrajectoryPlot,
+    WallClock,
+    WholeCheckpoints,
+)
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.distillation import LitDistillation
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, print_table
-from mambaloc.files import read_yaml
+from mambaloc.files import read_yaml, writing
 from mambaloc.models import LitPoseRegressor, list_models
 from mambaloc.models.base import read_checkpoint
 from mambaloc.models.registry import model_class
@@ -107,21 +114,30 @@ class RecipeCLI(LightningCLI):
             config.best_checkpoint.save_top_k = 0
 
     def instantiate_trainer(self, **kwargs: Any) -> L.Trainer:
-        """Log into the run's folder, unless the recipe names loggers of its own."""
+        """Log into the run's folder, and write checkpoints whole, unless the recipe names others that do."""
         config = self.config[self.subcommand]
         run_dir = str(run_directory(config))
         kwargs = {"default_root_dir": run_dir, **kwargs}
         if config.trainer.logger in (None, True) and not config.trainer.fast_dev_run:
             # TensorBoard first: checkpoints follow its place. A resumed run writes a CSV of its own beside the first.
             kwargs["logger"] = [TensorBoardLogger(run_dir, name="", version=""), CSVLogger(run_dir, name="metrics")]
-        return super().instantiate_trainer(**kwargs)
+        trainer = super().instantiate_trainer(**kwargs)
+        if not config.trainer.plugins:
+            trainer.strategy.checkpoint_io = WholeCheckpoints()
+        return trainer
 
     def fit(self, model: L.LightningModule, **kwargs: Any) -> None:
-        """Train; an interrupted run says how to go on."""
+        """Train; an interrupted run says how to go on.
+
+        Raises:
+            InputError: where the run's folder cannot be written.
+        """
+        run_dir = Path(self.trainer.default_root_dir)
         try:
-            self.trainer.fit(model, **{**kwargs, "weights_only": True})
+            with writing(run_dir, "free some space, or choose another --trainer.default_root_dir"):
+                self.trainer.fit(model, **{**kwargs, "weights_only": True})
         except SystemExit:  # Lightning's answer to Ctrl-C
-            last = Path(self.trainer.default_root_dir, "checkpoints", "last.ckpt")
+            last = run_dir / "checkpoints" / "last.ckpt"
             if last.is_file():
                 print(f"interrupted: go on with the same command and --ckpt_path {last}", file=sys.stderr)
             raise

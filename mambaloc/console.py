@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+import threading
 import warnings
 from collections.abc import Callable
 from functools import wraps
@@ -50,6 +51,7 @@ def thread_count(text: str) -> int:
 
 def quieten() -> None:
     """Keep what a user can act on: no hardware lists, tips, nor warnings about the insides of libraries."""
+    threading.excepthook = _show_unless_of_the_disk
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", "LightningCLI's args parameter is intended")  # ours are made from sys.argv
@@ -58,3 +60,9 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", "Found .* in eval mode at the start")  # a teacher, or frozen groups
     warnings.filterwarnings("ignore", ".*does not have many workers")  # decoded frames need none
     warnings.filterwarnings("ignore", "Total length of `list` across ranks is zero")  # no validation was asked for
+
+
+def _show_unless_of_the_disk(error: threading.ExceptHookArgs) -> None:
+    """Leave out what TensorBoard's thread could not write: the one that logs is told, too."""
+    if not issubclass(error.exc_type, OSError):
+        threading.__excepthook__(error)

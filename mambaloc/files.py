@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -83,8 +84,12 @@ def path_inside(folder: Path, name: str) -> Path | None:
 
 
 @contextmanager
-def writing(folder: Path) -> Iterator[None]:
+def writing(folder: Path, remedy: str = "choose another folder with --out") -> Iterator[None]:
     """Tell an error of the block, which writes to a folder, in one line.
+
+    Args:
+        folder: what is told.
+        remedy: what the user may do where it cannot be written.
 
     Raises:
         InputError: where it cannot be written.
@@ -92,13 +97,13 @@ def writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder with --out") from None
+        raise InputError(f"{folder}: cannot be written ({error.strerror or error}); {remedy}") from None
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Give a file beside a path to write to, which gets its name once the block ends; an error leaves nothing."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # nobody else's
     try:
         yield partial
         partial.replace(path)
@@ -126,7 +131,7 @@ def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
         partial.replace(folder)
     except OSError as error:
         file = Path(error.filename) if isinstance(error.filename, str) else folder
-        where = folder if partial is not None and file.is_relative_to(partial) else file
+        where = folder if partial is None or file.is_relative_to(partial) else file
         raise InputError(f"{where}: {error.strerror or error}; {remedy}") from None
     finally:
         if partial is not None:

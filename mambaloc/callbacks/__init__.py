@@ -5,5 +5,6 @@ from mambaloc.callbacks.onnx_export import OnnxExport
 from mambaloc.callbacks.progress import PoseProgressBar
 from mambaloc.callbacks.trajectory_plot import TrajectoryPlot
 from mambaloc.callbacks.wall_clock import WallClock
+from mambaloc.callbacks.whole_checkpoints import WholeCheckpoints
 
-__all__ = ["EarlyStopping", "OnnxExport", "PoseProgressBar", "TrajectoryPlot", "WallClock"]
+__all__ = ["EarlyStopping", "OnnxExport", "PoseProgressBar", "TrajectoryPlot", "WallClock", "WholeCheckpoints"]

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from mambaloc.errors import InputError
+from mambaloc.files import whole_file, writing
 from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork, PositionScale
@@ -94,8 +95,7 @@ def export_onnx(
         InputError: where ONNX Runtime disagrees with PyTorch, or the file cannot be written.
     """
     deployed = DeployedNetwork(copy.deepcopy(system.network).cpu().float(), uncertainty).eval()
-    partial = path.with_name(f".{path.name}.partial")
-    try:
+    with writing(path, "choose another folder"), whole_file(path) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(deployed, contract, partial)
         parity = check_parity(deployed, partial, system.image_size)
@@ -106,12 +106,6 @@ def export_onnx(
                 f"{path}: ONNX Runtime differs from PyTorch by {parity.position_m:.2g} m and "
                 f"{parity.rotation_deg:.2g} deg, so it was not written; report the model and the versions"
             )
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
-    finally:
-        with contextlib.suppress(OSError):  # not there, or nowhere that a file could be
-            partial.unlink()
     return parity
 
 

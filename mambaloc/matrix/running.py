@@ -174,6 +174,8 @@ def _alone(out: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         raise InputError(f"{out}: another process runs cells into it; wait for it, or choose another --out") from None
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
     try:
         yield
     finally:

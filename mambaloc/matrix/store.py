@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -69,6 +71,8 @@ class Store:
                 self._database.execute(_TABLE)
         except OSError as error:
             raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
+        except sqlite3.OperationalError as error:
+            raise InputError(f"{self.path}: cannot be written ({error}); choose another --out") from None
         except sqlite3.Error as error:
             raise InputError(f"{self.path}: is no store of results ({error}); choose another --out") from None
 
@@ -89,7 +93,11 @@ class Store:
         self._database.close()
 
     def write(self, cell: Cell, results: dict[str, dict[str, Any]], seconds: float, error: str | None = None) -> None:
-        """Keep how a cell ended; what was kept of an earlier try is replaced."""
+        """Keep how a cell ended; what was kept of an earlier try is replaced.
+
+        Raises:
+            InputError: where it cannot be written; what it held, it holds.
+        """
         ended = datetime.now(UTC).isoformat(timespec="seconds")
         row = (
             cell.key,
@@ -100,15 +108,27 @@ class Store:
             seconds,
             ended,
         )
-        with self._database:
+        with self._told("free some space, and run the matrix again"), self._database:
             self._database.execute("INSERT OR REPLACE INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)", row)
 
     def read(self) -> dict[str, StoredCell]:
-        """Every cell that ended, by key, in the order they did."""
-        rows = self._database.execute(
-            "SELECT key, labels, words, error, results, seconds, ended FROM cells ORDER BY rowid"
-        ).fetchall()
-        return {
-            key: StoredCell(key, json.loads(labels), json.loads(words), error, json.loads(results), seconds, ended)
-            for key, labels, words, error, results, seconds, ended in rows
-        }
+        """Every cell that ended, by key, in the order they did.
+
+        Raises:
+            InputError: where the file is damaged.
+        """
+        with self._told("put a copy in its place, or choose another --out"):
+            rows = self._database.execute(
+                "SELECT key, labels, words, error, results, seconds, ended FROM cells ORDER BY rowid"
+            ).fetchall()
+            return {
+                key: StoredCell(key, json.loads(labels), json.loads(words), error, json.loads(results), seconds, ended)
+                for key, labels, words, error, results, seconds, ended in rows
+            }
+
+    @contextmanager
+    def _told(self, remedy: str) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, ValueError, TypeError, RecursionError) as error:  # a damaged row is no JSON, or no text
+            raise InputError(f"{self.path}: cannot be used ({str(error).splitlines()[0]}); {remedy}") from None

@@ -1,6 +1,7 @@
 """What is interrupted: each makes something in a folder, checks what lies there, and makes it again."""
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +11,14 @@ import numpy as np
 import torch
 
 from mambaloc.cli import main
-from mambaloc.data import PoseDataModule
+from mambaloc.data import PoseDataModule, capture_scene
 from mambaloc.data.cache import cached_frames
 from mambaloc.data.frames import BadFrames
 from mambaloc.evaluation import evaluate_checkpoint
 from mambaloc.export import contract_of, export_onnx, write_bundle
+from mambaloc.images import read_image
+from mambaloc.importing.importer import import_scene
+from mambaloc.matrix import Store, read_matrix, run_matrix, running, write_report
 from mambaloc.models.base import read_checkpoint
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Localiser
@@ -130,12 +134,47 @@ def check_trajectory(out):
     return path.exists() and len(path.read_text().splitlines()) == 1001
 
 
+def imported(inputs, out):
+    if not (out / "scene").exists():
+        import_scene(inputs / "capture", out / "scene", split="block")
+
+
+def check_scene(out):
+    if (out / "scene").exists():
+        for split, count in (("train", 12), ("test", 5)):
+            frames = capture_scene.read_split(out / "scene", split, BadFrames("error"))
+            assert len([read_image(path) for path in frames.image_paths]) == count
+    return (out / "scene").exists()
+
+
+def benchmark(inputs, out):
+    """A matrix whose trainings end at once, with the evaluation of one that was real; then its report."""
+    copy = f"import shutil, sys; shutil.copytree({str(inputs / 'run/evaluation')!r}, sys.argv[-1] + '/evaluation')"
+    running.TRAIN, running.find_spec = (sys.executable, "-c", copy), lambda name: None  # one after another
+    kept = {key: cell for key, cell in Store.ended(out / "results").items() if cell.error is None}
+    run_matrix(read_matrix(inputs / "matrix.yaml"), out / "results", retry_failed=True)
+    assert kept.items() <= Store.ended(out / "results").items()  # the cells that had ended are not run again
+    if not (out / "report").exists():
+        write_report(out / "results", out / "report")
+
+
+def check_benchmark(out):
+    cells = Store.ended(out / "results").values()
+    assert all("metrics" in cell.results["last"] for cell in cells if cell.error is None)
+    if (out / "report").exists():
+        assert len((out / "report/tables/results.csv").read_text().splitlines()) == 2
+        assert (out / "report/report.html").read_text().rstrip().endswith("</html>")
+    return (out / "report").exists() and len(cells) == 2
+
+
 SUBJECTS = {
     "decoding frames": Subject(decode, check_cache),
+    "import": Subject(imported, check_scene),
     "training": Subject(train, check_run),
     "export": Subject(export, check_export),
     "bundle": Subject(bundle, check_bundle),
     "publishing": Subject(release, check_release),
     "evaluation": Subject(evaluate, check_evaluation),
+    "benchmark": Subject(benchmark, check_benchmark),
     "trajectory": Subject(trajectory, check_trajectory),
 }

@@ -6,6 +6,7 @@ replaced by one that no file should hold.
 
 import json
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,14 +16,20 @@ from hypothesis import strategies as st
 
 from mambaloc.benchmark import Setting
 from mambaloc.cli import recipe_arguments
-from mambaloc.data import cambridge, seven_scenes
+from mambaloc.data import cambridge, capture_scene, seven_scenes
+from mambaloc.data.download import download
 from mambaloc.data.frames import BadFrames
-from mambaloc.data.rendering import read_pose_table
+from mambaloc.data.points import read_points
+from mambaloc.data.rendering import read_pose_table, shots_of_sequences, write_cambridge
+from mambaloc.data.rendering.trajectories import smooth_trajectory
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
-from mambaloc.matrix import read_matrix
+from mambaloc.importing.formats import read_capture
+from mambaloc.importing.importer import import_scene
+from mambaloc.matrix import Cell, Store, read_matrix
 from mambaloc.models.base import read_checkpoint
 from mambaloc.runtime import Contract, Localiser
+from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.zoo.loading import load_released
 from mambaloc.zoo.manifest import Manifest
 
@@ -143,6 +150,66 @@ def test_pose_table(tmp_path, fed):
     fed("pose table", lambda path: read_pose_table(path, "heads", "7scenes"), table)
 
 
+def test_points_of_a_model(tmp_path, fed):
+    walks = {n: smooth_trajectory(4, n, ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))) for n in (1, 2)}
+    shots = shots_of_sequences(walks, test=(2,), image="seq{sequence}/frame{frame:05d}.png")
+    folder = write_cambridge(tmp_path, "Yard", shots, size=(48, 36), points=True)
+    frames = cambridge.read_split(folder, "train", BadFrames())
+    fed("NVM model", lambda path: read_points(path.parent, frames, 20, seed=0), folder / "reconstruction.nvm")
+
+
+@pytest.mark.parametrize("name", ["frames.csv", "scene.json"])
+def test_imported_scenes(name, captured, tmp_path, fed):
+    folder = tmp_path / "scene"
+    import_scene(captured, folder, split="block")
+
+    def parse(_: Path) -> None:
+        capture_scene.read_split(folder, "train", BadFrames())
+        capture_scene.focal_ratio_of(folder)
+        capture_scene.describe_capture(folder)
+
+    fed(f"imported scene's {name}", parse, folder / name)
+
+
+@pytest.fixture
+def captured(scenes, tmp_path):
+    """Frames of the scene as nerfstudio has them: another camera's axes, the same centres."""
+    folder = shutil.copytree(scenes / "heads", tmp_path / "captured")
+    frames = []
+    for file in sorted(folder.glob("seq-0[12]/*.pose.txt")):
+        pose = [[float(word) for word in line.split()] for line in file.read_text().splitlines() if line.strip()]
+        axes = [[x, -y, -z, at] for x, y, z, at in pose]
+        picture = file.relative_to(folder).as_posix().replace("pose.txt", "color.png")
+        frames.append({"file_path": picture, "transform_matrix": axes})
+    lens = {"fl_x": 80.0, "fl_y": 80.0, "cx": 48.0, "cy": 36.0, "w": 96, "h": 72}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    return folder
+
+
+def test_transforms(captured, fed):
+    fed("transforms.json", lambda path: read_capture(path.parent, "nerfstudio"), captured / "transforms.json")
+
+
+def test_stores(tmp_path, fed):
+    with Store(tmp_path) as store:
+        for number in range(3):
+            cell = Cell({"system": "a", "seed": str(number)}, ("recipe.yaml",), str(number) * 64)
+            store.write(cell, {"last": {"metrics": {"position_error_m": 0.5}}}, 1.0)
+    fed("store of results", lambda path: Store.ended(path.parent), tmp_path / "results.sqlite")
+
+
+def test_archives(scenes, tmp_path, fed):
+    with zipfile.ZipFile(tmp_path / "heads.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("TrainSplit.txt", "TestSplit.txt", "seq-01/frame-000000.pose.txt"):
+            archive.write(scenes / "heads" / name, name)
+
+    def parse(path: Path) -> None:
+        shutil.rmtree(path.with_suffix(""), ignore_errors=True)
+        download("7scenes", "heads", path.parent, accept_changed=True)
+
+    fed("downloaded zip", parse, tmp_path / "heads.zip")
+
+
 LABEL = "seq1/frame00001.png 1 2 3 1 0 0 0"
 
 
@@ -228,6 +295,14 @@ def test_checkpoints(tiny_recipe, tmp_path, fed):
 
     main([str(tiny_recipe), "--trainer.max_epochs", "1", "--trainer.default_root_dir", str(tmp_path / "run")])
     fed("checkpoint", read_checkpoint, tmp_path / "run/checkpoints/last.ckpt")
+
+
+@pytest.mark.slow
+def test_bundles(inputs, tmp_path, fed):
+    from subjects import bundle
+
+    bundle(inputs, tmp_path)
+    fed("bundle's contract", lambda path: verify_bundle(path.parent, 1), tmp_path / "bundle/contract.json")
 
 
 @pytest.mark.slow

@@ -63,6 +63,7 @@ def test_files_come_with_what_threads_and_safety_need(folder, served):
         "/sub/",
         "/sub",
         "/nothing",
+        "/%00",
     ],
 )
 def test_nothing_outside_and_no_listing(folder, path, served):
