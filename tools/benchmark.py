@@ -72,7 +72,8 @@ def _deployment(args: argparse.Namespace) -> None:
 
 
 def _uncertainty(args: argparse.Namespace) -> None:
-    found = benchmark.measure_certainty(args.checkpoints, args.elsewhere)
+    systems = {checkpoint: load_with_data(checkpoint) for checkpoint in args.checkpoints}
+    found = benchmark.measure_certainty(systems, args.elsewhere)
     benchmark.print_certainty(found, _machine())
     benchmark.write_certainty(found, args.out, _machine())
     print(f"{args.out}: uncertainty.json, uncertainty.png")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from mambaloc.data.augmentation import center_corner
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, position_error_m, rotation_error_deg
 from mambaloc.images import PICTURES, read_image
+from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork
 from mambaloc.types import PosePrediction
 from mambaloc.uncertainty import (
@@ -29,7 +30,6 @@ from mambaloc.uncertainty import (
     head_and_held_out,
     pooled,
 )
-from mambaloc.zoo.bundles import load_with_data
 
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9)
 PASSES = 8
@@ -65,10 +65,10 @@ class Way:
 
 @dataclass(frozen=True)
 class Certainty:
-    """What was found of one checkpoint.
+    """What was found of one system.
 
     Args:
-        checkpoint: whose errors are told.
+        name: of the system whose errors are told.
         where: which system, on which scene.
         held_out_frames: that its radii were measured on.
         position_error_m: of each test frame, (N,).
@@ -80,7 +80,7 @@ class Certainty:
         ways: of telling; the first is the exported one.
     """
 
-    checkpoint: str
+    name: str
     where: str
     held_out_frames: int
     position_error_m: Tensor
@@ -92,21 +92,23 @@ class Certainty:
     ways: list[Way]
 
 
-def measure_certainty(checkpoints: Sequence[str], elsewhere: Path | None = None) -> list[Certainty]:
+def measure_certainty(
+    systems: Mapping[str, tuple[LitPoseRegressor, PoseDataModule]], elsewhere: Path | None = None
+) -> list[Certainty]:
     """Compare ways of telling how sure a pose is, on the test frames of trained systems.
 
     Args:
-        checkpoints: of one scene; several are also taken for an ensemble.
+        systems: by name, each with the data that it was trained with, all of one scene; several are also taken for an
+            ensemble.
         elsewhere: folder of pictures of another place.
 
     Raises:
-        InputError: for a bad checkpoint, too few frames held out, or pictures that cannot be read.
+        InputError: for too few frames held out, or pictures that cannot be read.
     """
-    systems = [load_with_data(checkpoint) for checkpoint in checkpoints]
-    networks = [copy.deepcopy(system.network).cpu().float().eval() for system, _ in systems]
+    networks = [copy.deepcopy(system.network).cpu().float().eval() for system, _ in systems.values()]
     found = []
-    for (system, data), network, checkpoint in zip(systems, networks, checkpoints, strict=True):
-        with Console(stderr=True).status(f"measuring {checkpoint}"):
+    for (name, (system, data)), network in zip(systems.items(), networks, strict=True):
+        with Console(stderr=True).status(f"measuring {name}"):
             head, held_out = head_and_held_out(system, data)
             data.setup("test")
             test = errors_by_distance(network, head, data, "test")
@@ -116,7 +118,7 @@ def measure_certainty(checkpoints: Sequence[str], elsewhere: Path | None = None)
             by_spread = _by_spread(network, networks, data.crop, _test_frames(data), there)
         found.append(
             Certainty(
-                checkpoint,
+                name,
                 f"{system.registry_name} on {data.hparams['dataset']}/{data.hparams['scene']}, test",
                 len(held_out.distance),
                 test.position_error_m,

@@ -91,7 +91,7 @@ def write_certainty(found: Sequence[Certainty], folder: Path, machine: str) -> N
         "compared": compared(found),
         "checkpoints": [
             {
-                "checkpoint": each.checkpoint,
+                "checkpoint": each.name,
                 "held_out_frames": each.held_out_frames,
                 "test_frames": len(each.position_error_m),
                 "coverage": each.coverage,

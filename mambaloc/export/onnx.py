@@ -103,8 +103,9 @@ def export_onnx(
         is_close = parity.position_m <= tolerance_m * size_m and parity.rotation_deg <= tolerance_deg
         if not (is_close and parity.uncertainty <= _TOLERANCE):
             raise InputError(
-                f"{path}: ONNX Runtime differs from PyTorch by {parity.position_m:.2g} m and {parity.rotation_deg:.2g} deg, "
-                f"its radii by {parity.uncertainty:.1%}, so it was not written; report the model and the versions"
+                f"{path}: ONNX Runtime differs from PyTorch by {parity.position_m:.2g} m, "
+                f"{parity.rotation_deg:.2g} deg and {parity.uncertainty:.1%} of a radius, so it was not written; "
+                "report the model and the versions"
             )
     return parity
 

@@ -15,6 +15,7 @@ from mambaloc.cli import main
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical
 from mambaloc.types import PosePrediction
+from mambaloc.zoo.bundles import load_with_data
 
 
 def test_figures_against_scipy():
@@ -47,11 +48,11 @@ def test_spreads_by_hand():
 
 
 @pytest.fixture
-def checkpoints(tiny_recipe, tmp_path):
+def systems(tiny_recipe, tmp_path):
     for seed in ("0", "1"):
         options = ["--seed_everything", seed, "--trainer.max_epochs", "1"]
         main([str(tiny_recipe), *options, "--trainer.default_root_dir", str(tmp_path / seed)])
-    return [str(tmp_path / seed / "checkpoints/last.ckpt") for seed in ("0", "1")]
+    return [load_with_data(str(tmp_path / seed / "checkpoints/last.ckpt")) for seed in ("0", "1")]
 
 
 @pytest.fixture
@@ -65,8 +66,8 @@ def elsewhere(tmp_path):
 
 
 @pytest.mark.slow
-def test_all_of_it_on_a_tiny_scene(checkpoints, elsewhere, tmp_path, capsys):
-    found = measure_certainty(checkpoints, elsewhere)
+def test_all_of_it_on_a_tiny_scene(systems, elsewhere, tmp_path, capsys):
+    found = measure_certainty(dict(zip("ab", systems, strict=True)), elsewhere)
     for each in found:
         assert [way.name for way in each.ways] == ["training images", "dropout", "shifted crops", "ensemble of 2"]
         assert all((len(way.position), len(way.rotation), len(way.elsewhere)) == (8, 8, 3) for way in each.ways)
@@ -91,8 +92,8 @@ def test_all_of_it_on_a_tiny_scene(checkpoints, elsewhere, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_one_checkpoint_and_no_other_place(checkpoints, tmp_path, capsys):
-    found = measure_certainty(checkpoints[:1])
+def test_one_checkpoint_and_no_other_place(systems, tmp_path, capsys):
+    found = measure_certainty({"a": systems[0]})
     assert len(found[0].ways) == 3
     write_certainty(found, tmp_path, "a machine")
     assert json.loads((tmp_path / "uncertainty.json").read_text())["checkpoints"][0]["unfamiliar_elsewhere"] is None
@@ -100,4 +101,4 @@ def test_one_checkpoint_and_no_other_place(checkpoints, tmp_path, capsys):
     assert "another place" not in capsys.readouterr().out
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match=r"--elsewhere .*none: holds no \.png"):
-        measure_certainty(checkpoints[:1], tmp_path / "none")
+        measure_certainty({"a": systems[0]}, tmp_path / "none")
