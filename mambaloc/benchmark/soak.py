@@ -151,7 +151,7 @@ def draw_soak(samples: list[Sample], path: Path, title: str) -> None:
     for axes, of in zip(figure.subplots(len(shown), 1, sharex=True), shown, strict=True):
         axes.plot([sample.step for sample in samples], [getattr(sample, of) for sample in samples], color="#1d4ed8")
         axes.set_ylabel(SHOWN[of].replace(" (", "\n("), fontsize=9)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.15 * max(getattr(sample, of) for sample in samples))
         axes.grid(color="#e5e7eb", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlabel("step")
