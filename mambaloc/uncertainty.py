@@ -102,7 +102,8 @@ class UncertaintyHead(nn.Module):
         self.level, self.held_out_frames = level, len(far)
         self.intercepts.copy_(torch.from_numpy(lines[:, 0]))
         self.slopes.copy_(torch.from_numpy(lines[:, 1]))
-        self.familiar.fill_(conformal_quantile(far, min(_FAMILIAR, len(far) / (len(far) + 1))))
+        familiar = conformal_quantile(far, min(_FAMILIAR, len(far) / (len(far) + 1)))
+        self.familiar.fill_(max(familiar, 1e-6))  # held-out frames may all be copies of training frames
 
     def radii(self, distance: Tensor) -> Tensor:
         """The position's radius in metres and the rotation's in degrees at each distance; (B,) -> (B, 2)."""
@@ -117,6 +118,8 @@ class UncertaintyHead(nn.Module):
 
 def fit_uncertainty(system: LitPoseRegressor, data: PoseDataModule) -> UncertaintyHead:
     """Measure how a system's errors grow with the distance to the training images, on its validation frames.
+
+    Where the best epoch was chosen on them, they flatter it a little.
 
     Args:
         system: trained; left as it was.

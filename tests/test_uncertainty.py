@@ -113,6 +113,13 @@ def test_a_radius_is_never_nothing():
     assert torch.all(head.slopes > 0)
 
 
+def test_copies_of_training_frames_leave_finite_numbers():
+    nothing = torch.zeros(20)
+    metres, degrees, unfamiliarity = head_of(ErrorsByDistance(nothing, nothing, nothing))(torch.ones(1, 4))
+    assert torch.isfinite(torch.stack((metres, degrees, unfamiliarity))).all()
+    assert unfamiliarity > 1
+
+
 def test_familiar_is_what_nearly_all_held_out_frames_are():
     distance = torch.arange(1.0, 201)
     assert head_of(ErrorsByDistance(distance, distance, distance)).familiar == 199  # the 199th of 201 is 99 %

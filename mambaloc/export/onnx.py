@@ -148,7 +148,7 @@ def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], s
         position_m.append((actual_m - expected_m).norm(dim=-1).max())
         rotation_deg.append(rotation_error_deg(actual_q, expected_q).max())
         reach_m.append(expected_m.norm(dim=-1).max())
-        uncertainty += [((a - e) / e).abs().max() for a, e in zip(actual, expected, strict=True)]
+        uncertainty += [((a - e).abs() / e.clamp_min(1e-6)).max() for a, e in zip(actual, expected, strict=True)]
     differences = (position_m, rotation_deg, reach_m, uncertainty)
     return Parity(*(torch.stack(each).max().item() for each in differences))  # NaN stays NaN
 
