@@ -24,6 +24,7 @@ from mambaloc.viz.trajectory import write_png
 
 _SELF = Path("/proc/self")
 _SAMPLES = 200
+_FEWEST = 10  # steps
 _WARM_UP = 0.2  # of the steps: allocators and caches fill, first validation and first checkpoint
 _TRAIN = "from mambaloc.cli import main; main()"
 
@@ -96,10 +97,12 @@ def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]
         out: the run's folder, which must not be there yet.
 
     Raises:
-        InputError: where there is no recipe or no ``/proc``, the folder is there, or the training fails.
+        InputError: for too few steps, where there is no recipe or no ``/proc``, the folder is there, or the training fails.
     """
     if not (_SELF / "status").is_file():
         raise InputError("soak: open files and threads are counted in /proc, which only Linux has; run it there")
+    if steps < _FEWEST:
+        raise InputError(f"--steps {steps}: give {_FEWEST} or more; growth is seen after the first fifth")
     if missing := next((recipe for recipe in recipes if not recipe.is_file()), None):
         raise InputError(f"{missing}: no such recipe; give one of recipes/")
     if out.exists():

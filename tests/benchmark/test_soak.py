@@ -51,6 +51,8 @@ def test_a_training_is_watched(tiny_recipe, tmp_path, capsys):
 def test_wrong_uses(tmp_path, tiny_recipe):
     with pytest.raises(InputError, match=r"none\.yaml: no such recipe"):
         measure_soak([tmp_path / "none.yaml"], 40, tmp_path / "out")
+    with pytest.raises(InputError, match="--steps 0: give 10 or more"):
+        measure_soak([tiny_recipe], 0, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     tiny_recipe.write_text("model: [")
     with pytest.raises(InputError, match=r"tiny\.yaml: its training ended with 2 \(.*tiny\.yaml.*\); see .*train\.log"):
