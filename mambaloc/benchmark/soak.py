@@ -97,7 +97,7 @@ def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]
         out: the run's folder, which must not be there yet.
 
     Raises:
-        InputError: for too few steps, where there is no recipe or no ``/proc``, the folder is there, or the training fails.
+        InputError: for too few steps, no recipe or no ``/proc``, a folder that is there, or a training that fails.
     """
     if not (_SELF / "status").is_file():
         raise InputError("soak: open files and threads are counted in /proc, which only Linux has; run it there")
