@@ -404,6 +404,12 @@ def test_members_that_escape_are_refused_by_name(tmp_path: Path, member: str | z
     assert not list(tmp_path.glob("evil"))
 
 
+def test_a_member_without_a_name_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.zip").write_bytes(zipped({"good": b"1", "x": b"2"}).replace(b"x", b"\0"))  # cut at a null, as C does
+    with pytest.raises(InputError, match=r"a\.zip: a member has no name; nothing is unpacked"):
+        unpack(tmp_path / "a.zip", tmp_path / "folder", limit_bytes=10_000)
+
+
 def test_bombs_are_refused(tmp_path: Path) -> None:
     bomb = zipped({"zeros": bytes(1_000_000)}, zipfile.ZIP_DEFLATED)
     half = zipped({"zeros": bytes(300_000)}, zipfile.ZIP_DEFLATED)

@@ -73,6 +73,8 @@ def _judge(
     """The members to write, with their paths, once all of them are found to be harmless."""
     members = []
     for info in opened.infolist():
+        if not info.filename:
+            raise _untrusted(name, "a member has no name")
         path = PurePosixPath(info.filename.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts or re.match("[A-Za-z]:", str(path)):
             raise _untrusted(name, f"member {info.filename!r} leads out of the folder")
