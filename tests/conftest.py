@@ -1,6 +1,11 @@
 """Data that every test may use: a tiny rendered scene, and recipes small enough to train in seconds."""
 
+import os
+
 import pytest
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # each worker a core of its own; read when torch is imported
 
 
 @pytest.fixture(scope="session", autouse=True)
