@@ -148,9 +148,10 @@ def _check_held_out(system: LitPoseRegressor, data: PoseDataModule) -> None:
     validation = data.hparams["validation"]
     if validation in ("none", "test_set"):
         raise InputError(f"data.validation {validation}: how sure a pose is needs held-out frames; train with auto")
-    data.setup("fit")
     trained_on = system.provenance.get("data", {}).get("fingerprints", {}).get("train")
-    if trained_on != data.describe()["fingerprints"]["train"]:
+    if trained_on is not None:  # else nothing need be decoded
+        data.setup("fit")
+    if trained_on is None or trained_on != data.describe()["fingerprints"]["train"]:
         raise InputError(
             f"{data.folder}: the system was trained on other frames, or does not say on which, so that none is known "
             "to be held out; give a checkpoint's own"

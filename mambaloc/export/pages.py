@@ -74,7 +74,9 @@ model and `contract.json`; `frames/` are for checking a port.
 def _uncertainty(contract: Contract) -> str:
     told = contract.uncertainty
     if told is None:
-        return "The models do not tell: no frames were held out of their training to measure it on."
+        return (
+            "The models do not tell: too few frames are known to have been held out of their training to measure it on."
+        )
     return (
         f"Beside the pose the models say `position_radius_m` and `rotation_radius_deg`: {told['level']:.0%} of the "
         f"{told['held_out_frames']} frames that were held out of training are within these of their true poses. "
