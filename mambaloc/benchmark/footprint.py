@@ -25,7 +25,8 @@ from mambaloc.models.transposenet import LitTransPoseNet
 
 Measured = TypeVar("Measured")
 
-_STATUS = Path("/proc/self/status")
+STATUS = Path("/proc/self/status")
+"""What Linux says of this process."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,8 @@ def _reference(setting: Setting, started_at: float, steps: int, workers: int) ->
 
 def peak_bytes() -> int:
     """Largest resident memory of this process so far."""
-    if _STATUS.is_file():  # what getrusage tells on Linux begins with the memory of the process that started this one
-        return _kilobytes(_STATUS, "VmHWM:") * 1024
+    if STATUS.is_file():  # what getrusage tells on Linux begins with the memory of the process that started this one
+        return said_of(STATUS, "VmHWM:") * 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
 
@@ -148,9 +149,10 @@ def peak_bytes() -> int:
 def _workers_bytes() -> int:
     """Memory that loader processes share with nobody; 0 where the system does not tell."""
     rolls = [Path(f"/proc/{worker.pid}/smaps_rollup") for worker in multiprocessing.active_children()]
-    return sum(1024 * _kilobytes(roll, "Private_Clean:", "Private_Dirty:") for roll in rolls if roll.is_file())
+    return sum(1024 * said_of(roll, "Private_Clean:", "Private_Dirty:") for roll in rolls if roll.is_file())
 
 
-def _kilobytes(file: Path, *names: str) -> int:
+def said_of(file: Path, *names: str) -> int:
+    """Sum of the numbers that a file of ``/proc`` gives these names; those of memory are kilobytes."""
     lines = (line.split() for line in file.read_text(encoding="utf-8").splitlines())
     return sum(int(words[1]) for words in lines if words and words[0] in names)

@@ -17,12 +17,13 @@ import torch
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from mambaloc.benchmark.footprint import STATUS, said_of
 from mambaloc.benchmark.report import new_table
 from mambaloc.errors import InputError
 from mambaloc.files import writing
+from mambaloc.viz.curves import COLORS, finish
 from mambaloc.viz.trajectory import write_png
 
-_SELF = Path("/proc/self")
 _SAMPLES = 200
 _FEWEST = 10  # steps
 _WARM_UP = 0.2  # of the steps: allocators and caches fill, first validation and first checkpoint
@@ -74,15 +75,14 @@ class ResourceWatch(L.Callback):
         self._started_at = self._started_at or time.monotonic()
         if trainer.global_step % self.every_n_steps:
             return
-        status = dict(line.split(":", 1) for line in (_SELF / "status").read_text(encoding="utf-8").splitlines())
         device = torch.cuda.memory_allocated() if torch.cuda.is_available() else 0
         sample = Sample(
             trainer.global_step,
             round(time.monotonic() - self._started_at, 3),
-            int(status["RssAnon"].split()[0]) / 1024,
+            said_of(STATUS, "RssAnon:") / 1024,
             device / 2**20,
-            len(list((_SELF / "fd").iterdir())),
-            int(status["Threads"]),
+            len(list(STATUS.with_name("fd").iterdir())),
+            said_of(STATUS, "Threads:"),
         )
         with self.out.open("a", encoding="utf-8") as file:
             file.write(json.dumps(asdict(sample)) + "\n")
@@ -99,7 +99,7 @@ def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]
     Raises:
         InputError: for too few steps, no recipe or no ``/proc``, a folder that is there, or a training that fails.
     """
-    if not (_SELF / "status").is_file():
+    if not STATUS.is_file():
         raise InputError("soak: open files and threads are counted in /proc, which only Linux has; run it there")
     if steps < _FEWEST:
         raise InputError(f"--steps {steps}: give {_FEWEST} or more; growth is seen after the first fifth")
@@ -152,11 +152,10 @@ def draw_soak(samples: list[Sample], path: Path, title: str) -> None:
     shown = [of for of in SHOWN if any(getattr(sample, of) for sample in samples)]
     figure = Figure(figsize=(8, 2.2 * len(shown)), layout="constrained")
     for axes, of in zip(figure.subplots(len(shown), 1, sharex=True), shown, strict=True):
-        axes.plot([sample.step for sample in samples], [getattr(sample, of) for sample in samples], color="#1d4ed8")
+        axes.plot([sample.step for sample in samples], [getattr(sample, of) for sample in samples], color=COLORS[1])
         axes.set_ylabel(SHOWN[of].replace(" (", "\n("), fontsize=9)
         axes.set_ylim(0, 1.15 * max(getattr(sample, of) for sample in samples))
-        axes.grid(color="#e5e7eb", linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
+        finish(axes)
     axes.set_xlabel("step")
     figure.suptitle(title, fontsize=11)
     with writing(path):

@@ -16,7 +16,7 @@ from torchmetrics.functional import spearman_corrcoef
 from torchmetrics.functional.classification import binary_auroc
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.augmentation import center_corner
+from mambaloc.data.augmentation import center_crop
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, position_error_m, rotation_error_deg
 from mambaloc.images import PICTURES, read_image
@@ -165,11 +165,10 @@ def median_of_surest(score: Tensor, error: Tensor, share: float) -> Tensor:
 
 def told_apart(score: Tensor, elsewhere: Tensor) -> float:
     """Area under the ROC curve: the chance that a picture of another place scores higher than a test frame."""
-    scores, of_elsewhere = (
-        torch.cat((score, elsewhere)),
-        torch.cat((torch.zeros(len(score)), torch.ones(len(elsewhere)))),
-    )
-    ranks = scores.unique(return_inverse=True)[1].double()  # what is no probability would be squashed to one
+    of_elsewhere = torch.cat((torch.zeros(len(score)), torch.ones(len(elsewhere))))
+    ranks = (
+        torch.cat((score, elsewhere)).unique(return_inverse=True)[1].double()
+    )  # what is no probability would be squashed to one
     return binary_auroc(ranks / ranks.max().clamp_min(1), of_elsewhere.long()).item()
 
 
@@ -178,21 +177,24 @@ def _by_spread(
 ) -> list[Way]:
     """Ways that localise an image several times, and take how far apart the poses are."""
     told: dict[str, tuple[int, Callable[[Tensor], list[PosePrediction]]]] = {
-        "dropout": (PASSES, lambda image: _dropped_out(network, _centre(image, size))),
+        "dropout": (PASSES, lambda image: _dropped_out(network, center_crop(image, size))),
         "shifted crops": (5, lambda image: [network(each) for each in _crops(image, size)]),
     }
     if len(networks) > 1:
-        told[f"ensemble of {len(networks)}"] = (len(networks), lambda i: [each(_centre(i, size)) for each in networks])
-    ways = []
-    for name, (passes, poses) in told.items():
-        ways.append(Way(name, passes, *_spreads(poses, test), _spreads(poses, there)[0]))
-    return ways
+        told[f"ensemble of {len(networks)}"] = (
+            len(networks),
+            lambda i: [each(center_crop(i, size)) for each in networks],
+        )
+    return [
+        Way(name, passes, *_spreads(poses, test), _spreads(poses, there)[0]) for name, (passes, poses) in told.items()
+    ]
 
 
 @torch.inference_mode()
 def _spreads(poses: Callable[[Tensor], list[PosePrediction]], pictures: Pictures) -> tuple[Tensor, Tensor]:
     spreads = [pose_spread(poses(image)) for image in pictures()]
-    positions, rotations = zip(*spreads, strict=True) if spreads else ((torch.zeros(0),), (torch.zeros(0),))
+    none = torch.zeros(0)
+    positions, rotations = zip((none, none), *spreads, strict=True)
     return torch.cat(positions), torch.cat(rotations)
 
 
@@ -220,26 +222,18 @@ def _dropped_out(network: PoseNetwork, image: Tensor) -> list[PosePrediction]:
         network.eval()
 
 
-def _centre(image: Tensor, size: tuple[int, int]) -> Tensor:
-    top, left = center_corner(image, size)
-    return _cut(image, size, top, left)
-
-
 def _crops(image: Tensor, size: tuple[int, int]) -> list[Tensor]:
     """The middle and the four corners."""
-    bottom, right = image.shape[-2] - size[0], image.shape[-1] - size[1]
-    corners = [_cut(image, size, top, left) for top in (0, bottom) for left in (0, right)]
-    return [_centre(image, size), *corners]
-
-
-def _cut(image: Tensor, size: tuple[int, int], top: int, left: int) -> Tensor:
-    return image[..., top : top + size[0], left : left + size[1]].float() / 255
+    height, width = size
+    bottom, right = image.shape[-2] - height, image.shape[-1] - width
+    corners = [image[..., y : y + height, x : x + width].float() / 255 for y in (0, bottom) for x in (0, right)]
+    return [center_crop(image, size), *corners]
 
 
 @torch.inference_mode()
 def _distances(network: PoseNetwork, head: UncertaintyHead, size: tuple[int, int], pictures: Pictures) -> Tensor:
-    distances = [head.distance(pooled(network.backbone(_centre(image, size)))) for image in pictures()]
-    return torch.cat(distances) if distances else torch.zeros(0)
+    distances = [head.distance(pooled(network.backbone(center_crop(image, size)))) for image in pictures()]
+    return torch.cat([torch.zeros(0), *distances])
 
 
 def _no_pictures() -> Iterator[Tensor]:

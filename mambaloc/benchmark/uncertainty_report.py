@@ -26,7 +26,7 @@ from mambaloc.benchmark.uncertainty import (
     told_apart,
 )
 from mambaloc.files import whole_file, writing
-from mambaloc.viz.curves import COLORS
+from mambaloc.viz.curves import COLORS, finish
 from mambaloc.viz.trajectory import write_png
 
 _KEPT = np.linspace(1, 0.1, 46)
@@ -39,18 +39,18 @@ def print_certainty(found: Sequence[Certainty], machine: str) -> None:
     columns = ("passes", "rank m", "rank °", "median m", "median °", "told apart")
     table = new_table("How sure a pose is", "told by", *columns)
     for name, figures in compared(found).items():
-        changes = (f"{figures[f'{of}_change']:+.1%}" for of in _ERRORS)
         ranks = (f"{figures[f'{of}_rank_correlation']:.2f}" for of in _ERRORS)
+        changes = (f"{figures[f'{of}_change']:+.1%}" for of in _ERRORS)
         apart = "" if figures["told_apart"] is None else f"{figures['told_apart']:.3f}"
-        (metres, degrees), (rank_m, rank_deg) = changes, ranks
-        table.add_row(name, str(figures["passes"]), rank_m, rank_deg, metres, degrees, apart)
+        table.add_row(name, str(figures["passes"]), *ranks, *changes, apart)
     console.print(table)
     explained = "rank: correlation of scores' ranks with errors'"
     rejected = f"median: what leaving out the {REJECTED:.0%} least sure frames changes it by"
     console.print(f"{explained}; {rejected}; told apart: area under the ROC curve", soft_wrap=True)
     table = new_table("Test frames within the radii", "asked", "position", "rotation", "radius m", "°")
     for level in LEVELS:
-        shares, radii = (np.mean([of[level] for of in told], axis=0) for told in _told(found))
+        shares = np.mean([each.coverage[level] for each in found], axis=0)
+        radii = np.mean([each.radii[level] for each in found], axis=0)
         table.add_row(f"{level:.0%}", *(f"{share:.1%}" for share in shares), f"{radii[0]:.3f}", f"{radii[1]:.2f}")
     console.print(table)
     first = found[0]
@@ -122,9 +122,7 @@ def _draw(found: Sequence[Certainty], path: Path) -> None:
     handles, names = below[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False)
     for axes in (coverage, familiarity, *below):
-        axes.grid(color="#e5e7eb", linewidth=0.6)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
+        finish(axes)
     write_png(figure, path)
 
 
@@ -193,7 +191,3 @@ def _error(each: Certainty, of: str) -> Tensor:
 def _flagged(unfamiliarity: Tensor) -> float | None:
     """Share over 1; None of no pictures."""
     return (unfamiliarity > 1).double().mean().item() if len(unfamiliarity) else None
-
-
-def _told(found: Sequence[Certainty]) -> tuple[list[dict[float, tuple[float, float]]], ...]:
-    return [each.coverage for each in found], [each.radii for each in found]

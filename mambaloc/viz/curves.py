@@ -36,7 +36,7 @@ def plot_errors_by_time(axes: Axes, trainings: Mapping[str, Sequence[tuple[Seque
     for color, (name, lines) in zip(_colors(len(trainings)), trainings.items(), strict=True):
         for number, (seconds, errors) in enumerate(lines):
             axes.plot(seconds, errors, color=color, linewidth=1.4, marker=".", label=name if number == 0 else None)
-    _finish(axes)
+    finish(axes)
 
 
 def plot_errors_by_frames(axes: Axes, systems: Mapping[str, Sequence[Point]]) -> None:
@@ -59,7 +59,7 @@ def plot_errors_by_frames(axes: Axes, systems: Mapping[str, Sequence[Point]]) ->
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.minorticks_off()
-    _finish(axes)
+    finish(axes)
 
 
 def plot_cumulative(axes: Axes, errors: Mapping[str, NDArray[np.floating]]) -> None:
@@ -73,7 +73,7 @@ def plot_cumulative(axes: Axes, errors: Mapping[str, NDArray[np.floating]]) -> N
         share = np.arange(1, len(each) + 1) / len(each)
         axes.step(np.sort(each), share, where="post", color=color, linewidth=1.4, label=name)
     axes.axhline(0.5, color="#9ca3af", linewidth=0.8, linestyle=":")
-    _finish(axes)
+    finish(axes)
 
 
 def most_shown(errors: Iterable[NDArray[np.floating]]) -> float:
@@ -85,7 +85,8 @@ def _colors(count: int) -> list[str]:
     return [COLORS[number % len(COLORS)] for number in range(count)]
 
 
-def _finish(axes: Axes) -> None:
+def finish(axes: Axes) -> None:
+    """Give axes the look of all curves: a faint grid below, no frame above and on the right."""
     axes.grid(color="#e5e7eb", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
