@@ -92,7 +92,7 @@ class _Advisor:
         thin = rows[::every]
         length, turn_deg = apart(self.position, self.quaternion, thin, thin)
         is_seen = (length <= _LOOP_REACH * self.motion.extent) & (turn_deg <= REACH_DEG)
-        steps = np.maximum(length / self.motion.step, turn_deg / self.motion.step_deg)
+        steps = self.motion.steps(length, turn_deg)
         time = np.arange(len(thin))
         window = max(self.gap, round(_PASS_SHARE * len(thin)))
         for share in _LOOP_SHARES:
@@ -132,7 +132,7 @@ class _Advisor:
             test, near = rows[split[rows] == "test"], np.zeros(len(rows), dtype=bool)
             for start in range(0, len(test), _AT_ONCE):
                 length, turn_deg = apart(self.position, self.quaternion, test[start : start + _AT_ONCE], rows)
-                steps = np.maximum(length / self.motion.step, turn_deg / self.motion.step_deg)
+                steps = self.motion.steps(length, turn_deg)
                 near |= (steps <= NEAR_STEPS).any(axis=0)
             sparse[rows[near & (split[rows] == "train")]] = "unused"
         return sparse if _is_whole(sparse) else split

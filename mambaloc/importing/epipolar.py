@@ -18,6 +18,7 @@ from rich.progress import track
 from mambaloc.images import Image, read_image
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.motion import Motion, apart, quaternions
+from mambaloc.importing.posed import OPENCV_FROM_OPENGL
 
 Floats = NDArray[np.float64]
 
@@ -27,12 +28,11 @@ def _inverse(pose: Floats) -> Floats:
 
 
 AS_READ = "as they were read"
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
     AS_READ: lambda pose: pose,
     "world to camera": _inverse,
-    "camera to world in OpenGL's axes": lambda pose: pose @ _FLIP,
-    "world to camera in OpenGL's axes": lambda pose: _inverse(pose) @ _FLIP,
+    "camera to world in OpenGL's axes": lambda pose: pose @ OPENCV_FROM_OPENGL,
+    "world to camera in OpenGL's axes": lambda pose: _inverse(pose) @ OPENCV_FROM_OPENGL,
 }
 """What makes ``world_from_cam`` in OpenCV's axes of a pose that was meant otherwise."""
 

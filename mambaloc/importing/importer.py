@@ -20,7 +20,7 @@ from mambaloc.importing.conventions import check_agreement, check_axes, check_up
 from mambaloc.importing.epipolar import agreement
 from mambaloc.importing.findings import Finding, verdict_of
 from mambaloc.importing.formats import read_capture
-from mambaloc.importing.motion import motion_of
+from mambaloc.importing.motion import Motion, motion_of
 from mambaloc.importing.pictures import Size, selected, write_pictures
 from mambaloc.importing.report import write_report
 from mambaloc.importing.splits import ASKED, Chosen, Proposal, choose
@@ -110,9 +110,10 @@ def _checked(
     split = np.full(len(capture.images), "unused", dtype="<U6")
     if not any(finding.is_fatal for finding in findings):
         used = selected(capture, usable)
-        findings += [sanity.check_sizes(sizes, odd), *_of_poses(used)]
+        motion = motion_of(used)
+        findings += [sanity.check_sizes(sizes, odd), *_of_poses(used, motion)]
         if not any(finding.is_fatal for finding in findings):
-            proposals = propose(used, motion_of(used))
+            proposals = propose(used, motion)
             chosen = choose(proposals, asked)
             split[usable] = chosen.proposal.split
             findings.append(Finding("split", f"by {chosen.proposal.kind}: {chosen.proposal.how}", chosen.warning))
@@ -128,8 +129,8 @@ def _checked(
     )
 
 
-def _of_poses(capture: Capture) -> list[Finding]:
-    motion, unit = motion_of(capture), "m" if capture.unit == "metre" else "units"
+def _of_poses(capture: Capture, motion: Motion) -> list[Finding]:
+    unit = "m" if capture.unit == "metre" else "units"
     return [
         check_agreement(agreement(capture, motion)),
         check_up(capture, up_of(capture)),

@@ -46,6 +46,10 @@ class Motion:
     in_order: bool
     jumps: NDArray[np.int64]
 
+    def steps(self, length: Floats, turn_deg: Floats) -> Floats:
+        """How many steps a distance comes to, the larger of those moved and those turned."""
+        return np.maximum(length / self.step, turn_deg / self.step_deg)
+
 
 def motion_of(capture: Capture) -> Motion:
     """Measure the steps of a capture of two frames or more."""

@@ -5,7 +5,6 @@ Each frame has a camera-to-world matrix in OpenGL's camera axes: x right, y up, 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,10 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mambaloc.data.capture_scene import MOST_FRAMES
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
+from mambaloc.images import PICTURES
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.nerfstudio_cameras import KEYS, number, read_cameras
+from mambaloc.importing.posed import OPENCV_FROM_OPENGL
+from mambaloc.importing.untrusted import natural
 
 FILES: Mapping[str, str | None] = {
     "transforms.json": None,
@@ -27,10 +30,6 @@ FILES: Mapping[str, str | None] = {
     "transforms_test.json": "test",
 }
 """Names of the file, the one that holds all frames first, and the split that its frames are of."""
-
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
-_MOST_FRAMES = 200_000
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def read(source: Path) -> Capture:
         del files[1:]
     told = {file: _read(file) for file in files}
     listed = [frame for file, content in told.items() for frame in _frames(file, content)]
-    listed.sort(key=lambda frame: (_natural(frame.sequence), _natural(frame.name)))
+    listed.sort(key=lambda frame: (natural(Path(frame.sequence)), natural(Path(frame.name))))
     if twice := next((a.name for a, b in pairwise(listed) if a.name == b.name), None):
         raise InputError(f"{source}: lists {twice} twice; remove one of the two")
     present = [frame for frame in listed if frame.image.is_file()]
@@ -97,8 +96,8 @@ def _read(file: Path) -> dict[str, Any]:
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{file}: has no list of 'frames'; give a transforms.json of nerfstudio or instant-ngp")
-    if len(frames) > _MOST_FRAMES:
-        raise InputError(f"{file}: lists {len(frames)} frames, more than {_MOST_FRAMES}; keep fewer")
+    if len(frames) > MOST_FRAMES:
+        raise InputError(f"{file}: lists {len(frames)} frames, more than {MOST_FRAMES}; keep fewer")
     return content
 
 
@@ -110,7 +109,7 @@ def _frames(file: Path, content: dict[str, Any]) -> Iterator[_Listed]:
         where = f"{file}, frame {count}"
         image = _image(file, frame.get("file_path"), f"{where}: file_path")
         name = image.relative_to(file.parent).as_posix()
-        world_from_cam = _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix") @ _OPENGL_FROM_OPENCV
+        world_from_cam = _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix") @ OPENCV_FROM_OPENGL
         world_from_cam[:3, 3] /= scale
         own = {key: frame[key] for key in KEYS if key in frame}
         split = FILES[file.name] if FILES.get(file.name) else splits.get(name)
@@ -160,9 +159,9 @@ def _image(file: Path, name: Any, where: str) -> Path:
     path = path_inside(file.parent, name) if isinstance(name, str) else None
     if path is None:
         raise InputError(f"{where}: {str(name)[:80]!r} is no path inside of {file.parent}; correct it")
-    if path.suffix.lower() in _SUFFIXES:
+    if path.suffix.lower() in PICTURES:
         return path
-    named = [path.with_name(path.name + suffix) for suffix in (*_SUFFIXES, *(s.upper() for s in _SUFFIXES))]
+    named = [path.with_name(path.name + suffix) for suffix in (*PICTURES, *(s.upper() for s in PICTURES))]
     return next((each for each in named if each.is_file()), path)
 
 
@@ -183,10 +182,5 @@ def _beside(images: Sequence[Path]) -> tuple[Path, ...]:
     """Pictures in the folders of listed images that are not listed."""
     listed = set(images)
     folders = [folder for folder in dict.fromkeys(image.parent for image in images) if folder.is_dir()]
-    pictures = [path for folder in folders for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES]
+    pictures = [path for folder in folders for path in sorted(folder.iterdir()) if path.suffix.lower() in PICTURES]
     return tuple(path for path in pictures if path not in listed)
-
-
-def _natural(name: str) -> list[str | int]:
-    """A key that sorts ``frame_10`` after ``frame_9``."""
-    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", name, flags=re.ASCII))]

@@ -160,7 +160,7 @@ def distances(
     """
     rows = rows[np.linspace(0, len(rows) - 1, min(_MEASURED, len(rows))).round().astype(int)]
     length, turn_deg = apart(capture.world_from_cam[:, :3, 3], quaternions(capture), rows, others)
-    steps = np.maximum(length / motion.step, turn_deg / motion.step_deg)
+    steps = motion.steps(length, turn_deg)
     nearest = steps.argmin(axis=1)
     every = np.arange(len(rows))
     return length[every, nearest], turn_deg[every, nearest], steps[every, nearest]
