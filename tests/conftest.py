@@ -20,9 +20,9 @@ def cache_dir(tmp_path_factory):
 @pytest.fixture(scope="session")
 def scenes(tmp_path_factory):
     """A folder of rendered scenes in the 7-Scenes layout; ``heads`` has 2 x 12 training and 8 test frames."""
-    from mambaloc.data.rendering.layouts import write_7scenes
-    from mambaloc.data.rendering.shots import shots_of_sequences
-    from mambaloc.data.rendering.trajectories import smooth_trajectory
+    from mambaloc.rendering.scenes.layouts import write_7scenes
+    from mambaloc.rendering.scenes.shots import shots_of_sequences
+    from mambaloc.rendering.trajectories import smooth_trajectory
 
     root = tmp_path_factory.mktemp("scenes")
     inside_m = ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))

@@ -7,8 +7,8 @@ from mambaloc import benchmark, list_models, provenance
 from mambaloc.console import exits_cleanly, quieten, thread_count
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.matrix import Store, print_plan, read_matrix, run_matrix, write_report
 from mambaloc.models.registry import model_class
+from mambaloc.sweep import Store, print_plan, read_matrix, run_matrix, write_report
 from mambaloc.zoo.bundles import load_with_data
 
 
@@ -87,7 +87,7 @@ def _soak(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
-    matrix, out = read_matrix(args.matrix), args.out or Path("runs/matrices", args.matrix.stem)
+    matrix, out = read_matrix(args.matrix), args.out or Path("runs/sweeps", args.matrix.stem)
     if args.dry_run:
         print_plan(matrix, Store.ended(out))
         return
@@ -158,8 +158,8 @@ def _parser() -> argparse.ArgumentParser:
     part.add_argument("--out", type=Path, default=Path("runs/soak"), help="folder that is not there yet")
     part.set_defaults(call=_soak)
     part = parts.add_parser("run", help="train and evaluate a matrix of recipes, what ended before left alone")
-    part.add_argument("matrix", type=Path, help="as recipes/matrices/ holds them")
-    part.add_argument("--out", type=Path, help="folder of results.sqlite and runs/; runs/matrices/NAME unless given")
+    part.add_argument("matrix", type=Path, help="as recipes/sweeps/ holds them")
+    part.add_argument("--out", type=Path, help="folder of results.sqlite and runs/; runs/sweeps/NAME unless given")
     part.add_argument("--address", help="of a Ray cluster, whose machines all see --out")
     part.add_argument("--retry-failed", action="store_true", help="run cells again that failed")
     part.add_argument("--dry-run", action="store_true", help="list the cells and what they may take")

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from mambaloc.console import exits_cleanly
 from mambaloc.errors import InputError
-from mambaloc.importing.formats import FORMATS
 from mambaloc.importing.importer import import_scene
+from mambaloc.importing.registry import FORMATS
 from mambaloc.importing.report import print_summary
-from mambaloc.importing.splits import ASKED
+from mambaloc.importing.splits.selection import ASKED
 
 
 @exits_cleanly

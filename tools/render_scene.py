@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from mambaloc import rendering
 from mambaloc.console import exits_cleanly
-from mambaloc.data import rendering
 from mambaloc.errors import InputError
 
 

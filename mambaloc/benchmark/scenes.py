@@ -13,7 +13,7 @@ from rich.progress import track
 
 from mambaloc.benchmark.footprint import in_a_process, peak_bytes
 from mambaloc.data import PoseDataModule
-from mambaloc.data.datasets import DATASETS, scene_folder
+from mambaloc.data.datasets.registry import DATASETS, scene_folder
 from mambaloc.data.frames import BadFrames, Split
 from mambaloc.errors import InputError
 from mambaloc.user_cache import default_cache_dir

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mambaloc.data.datamodule import PoseDataModule
-    from mambaloc.data.datasets import DATASETS
+    from mambaloc.data.datasets.registry import DATASETS
     from mambaloc.data.frames import BadFrames, Frames
 
 # Imported on first use: downloading or rendering a scene needs no torch.
 _EXPORTS = {
     "BadFrames": "mambaloc.data.frames",
-    "DATASETS": "mambaloc.data.datasets",
+    "DATASETS": "mambaloc.data.datasets.registry",
     "Frames": "mambaloc.data.frames",
     "PoseDataModule": "mambaloc.data.datamodule",
 }

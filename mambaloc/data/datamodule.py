@@ -25,8 +25,8 @@ from mambaloc.data.augmentation import (
     turned,
 )
 from mambaloc.data.cached_dataset import CachedFrames
-from mambaloc.data.capture_scene import describe_capture, focal_ratio_of
-from mambaloc.data.datasets import CAPTURE, DATASETS, is_official, is_rendered, locate, scene_folder
+from mambaloc.data.datasets.capture import describe_capture, focal_ratio_of
+from mambaloc.data.datasets.registry import CAPTURE, DATASETS, is_official, is_rendered, locate, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
 from mambaloc.data.loaded_split import LoadedSplit, describe_points, load_split
 from mambaloc.data.points import read_points

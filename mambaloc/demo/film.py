@@ -13,9 +13,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from mambaloc.data.rendering import GENERATOR_VERSION, default_intrinsics, embedded_room, embedded_walk, render, sensor
-from mambaloc.data.rendering.poses import quaternion_from_matrix
 from mambaloc.errors import InputError
+from mambaloc.rendering import GENERATOR_VERSION, default_intrinsics, embedded_room, embedded_walk, render, sensor
+from mambaloc.rendering.poses import quaternion_from_matrix
 from mambaloc.user_cache import made_once
 
 FILM_FILE, POSES_FILE = "film.webm", "film.json"

@@ -1,4 +1,4 @@
-"""``frames.csv`` and ``scene.json``: what :mod:`mambaloc.data.capture_scene` reads, and where all of it is from."""
+"""``frames.csv`` and ``scene.json``: what :mod:`mambaloc.data.datasets.capture` reads, and where all of it is from."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from mambaloc import provenance
-from mambaloc.data.capture_scene import COLUMNS, FRAMES_FILE, SCENE_FILE, VERSION, VERSION_KEY
+from mambaloc.data.datasets.capture import COLUMNS, FRAMES_FILE, SCENE_FILE, VERSION, VERSION_KEY
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.findings import Finding, Verdict
+from mambaloc.importing.checks.findings import Finding, Verdict
 from mambaloc.importing.motion import quaternions
-from mambaloc.importing.splits import RULE, Chosen, Proposal
+from mambaloc.importing.splits.selection import RULE, Chosen, Proposal
 
 POSE = (
     "world_from_cam: x, y, z is the camera centre, qw, qx, qy, qz a unit quaternion with qw >= 0; OpenCV camera axes "

@@ -39,7 +39,7 @@ class Capture:
     """Posed images, sequence after sequence, each in the order it was taken.
 
     Args:
-        kind: the format, as :data:`mambaloc.importing.formats.FORMATS` names it.
+        kind: the format, as :data:`mambaloc.importing.registry.FORMATS` names it.
         images: N files, all there.
         sequences: N names of recordings.
         world_from_cam: (N, 4, 4) float64, OpenCV camera axes.

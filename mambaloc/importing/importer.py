@@ -12,18 +12,18 @@ import numpy as np
 
 from mambaloc.errors import InputError
 from mambaloc.files import whole_folder
-from mambaloc.importing import sanity
-from mambaloc.importing.advisor import propose
 from mambaloc.importing.canonical import Imported, write_frames, write_scene
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.conventions import check_agreement, check_axes, check_up, up_of
-from mambaloc.importing.epipolar import agreement
-from mambaloc.importing.findings import Finding, verdict_of
-from mambaloc.importing.formats import read_capture
+from mambaloc.importing.checks import sanity
+from mambaloc.importing.checks.conventions import check_agreement, check_axes, check_up, up_of
+from mambaloc.importing.checks.epipolar import agreement
+from mambaloc.importing.checks.findings import Finding, verdict_of
 from mambaloc.importing.motion import Motion, motion_of
-from mambaloc.importing.pictures import Size, selected, write_pictures
+from mambaloc.importing.registry import read_capture
 from mambaloc.importing.report import write_report
-from mambaloc.importing.splits import ASKED, Chosen, Proposal, choose
+from mambaloc.importing.splits.advisor import propose
+from mambaloc.importing.splits.selection import ASKED, Chosen, Proposal, choose
+from mambaloc.importing.undistort.pictures import Size, selected, write_pictures
 
 _MOST_SCALE = 1e6
 _FAR = 1000.0
@@ -45,7 +45,7 @@ def import_scene(
         out: the scene's folder, which must not be there yet.
         kind: the capture's format; found out unless given.
         metres_per_unit: what the format's unit is; as the format tells unless given.
-        split: of :data:`~mambaloc.importing.splits.ASKED`.
+        split: of :data:`~mambaloc.importing.splits.selection.ASKED`.
         command: that this was asked for with.
 
     Raises:

@@ -9,9 +9,9 @@ from rich.console import Console
 from rich.table import Table
 
 from mambaloc.importing.canonical import Imported
-from mambaloc.importing.conventions import up_of
+from mambaloc.importing.checks.conventions import up_of
 from mambaloc.importing.motion import motion_of
-from mambaloc.importing.splits import RULE, Proposal
+from mambaloc.importing.splits.selection import RULE, Proposal
 from mambaloc.viz import draw_capture
 
 REPORT_FILE, PLOT_FILE = "report.md", "trajectory.png"

@@ -11,19 +11,20 @@ import numpy as np
 import torch
 
 from mambaloc.cli import main
-from mambaloc.data import PoseDataModule, capture_scene
+from mambaloc.data import PoseDataModule
 from mambaloc.data.cache import cached_frames
+from mambaloc.data.datasets import capture as capture_scene
 from mambaloc.data.frames import BadFrames
 from mambaloc.evaluation import evaluate_checkpoint
 from mambaloc.export import contract_of, export_onnx, write_bundle
 from mambaloc.images import read_image
 from mambaloc.importing.importer import import_scene
-from mambaloc.matrix import Store, read_matrix, run_matrix, running, write_report
 from mambaloc.models.base import read_checkpoint
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.trajectory import write_tum
+from mambaloc.sweep import Store, read_matrix, run_matrix, running, write_report
 from mambaloc.zoo import load
 from mambaloc.zoo.publishing import publish
 

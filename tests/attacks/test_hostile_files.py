@@ -16,20 +16,21 @@ from hypothesis import strategies as st
 
 from mambaloc.benchmark import Setting
 from mambaloc.cli import recipe_arguments
-from mambaloc.data import cambridge, capture_scene, seven_scenes
+from mambaloc.data.datasets import cambridge, seven_scenes
+from mambaloc.data.datasets import capture as capture_scene
 from mambaloc.data.download import download
 from mambaloc.data.frames import BadFrames
 from mambaloc.data.points import read_points
-from mambaloc.data.rendering import read_pose_table, shots_of_sequences, write_cambridge
-from mambaloc.data.rendering.trajectories import smooth_trajectory
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
-from mambaloc.importing.formats import read_capture
 from mambaloc.importing.importer import import_scene
-from mambaloc.matrix import Cell, Store, read_matrix
+from mambaloc.importing.registry import read_capture
 from mambaloc.models.base import read_checkpoint
+from mambaloc.rendering import read_pose_table, shots_of_sequences, write_cambridge
+from mambaloc.rendering.trajectories import smooth_trajectory
 from mambaloc.runtime import Contract, Localiser
 from mambaloc.runtime.bundle import verify_bundle
+from mambaloc.sweep import Cell, Store, read_matrix
 from mambaloc.zoo.loading import load_released
 from mambaloc.zoo.manifest import Manifest
 
@@ -260,7 +261,7 @@ def test_overlays(tmp_path, fed):
 
 
 def test_matrices(tmp_path, fed):
-    matrix = shutil.copy(REPOSITORY / "recipes/matrices/redkitchen_blocks.yaml", tmp_path)
+    matrix = shutil.copy(REPOSITORY / "recipes/sweeps/redkitchen_blocks.yaml", tmp_path)
     fed("matrix", read_matrix, Path(matrix))
 
 

@@ -13,11 +13,12 @@ import pytest
 from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
-from mambaloc.data import cambridge, capture_scene
+from mambaloc.data.datasets import cambridge
+from mambaloc.data.datasets import capture as capture_scene
 from mambaloc.data.download.archives import unpack
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
-from mambaloc.importing.formats import read_capture
+from mambaloc.importing.registry import read_capture
 from mambaloc.runtime.bundle import verify_bundle
 
 PICTURE = cv2.imencode(".png", np.zeros((4, 6, 3), np.uint8))[1].tobytes()

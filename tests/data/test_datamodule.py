@@ -14,9 +14,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mambaloc.data import datasets
 from mambaloc.data.augmentation import Jitter, augment, augmentations, draw_uniforms
 from mambaloc.data.datamodule import PoseDataModule
+from mambaloc.data.datasets import registry as datasets
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical
 from mambaloc.types import PoseBatch
@@ -377,6 +377,6 @@ def test_the_embedded_scene_is_made_where_there_is_none(write_tiny_scene, tmp_pa
         made.append(root)
         return write_tiny_scene({1: 4, 2: 2}, test=(2,), name="room").folder
 
-    monkeypatch.setattr("mambaloc.data.rendering.embedded.ensure_embedded_scene", ensure)
+    monkeypatch.setattr("mambaloc.rendering.scenes.embedded.ensure_embedded_scene", ensure)
     assert datasets.scene_folder("embedded", tmp_path / "here", "anything").name == "room"
     assert made == [tmp_path / "here"]

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mambaloc.data.cambridge import read_split
+from mambaloc.data.datasets.cambridge import read_split
 from mambaloc.data.frames import BadFrames, Frames
 from mambaloc.data.points import ScenePoints, colmap, read_points
-from mambaloc.data.rendering import default_intrinsics, furnished_room, render, shots_of_sequences, write_cambridge
-from mambaloc.data.rendering.trajectories import smooth_trajectory
 from mambaloc.errors import InputError
+from mambaloc.rendering import default_intrinsics, furnished_room, render, shots_of_sequences, write_cambridge
+from mambaloc.rendering.trajectories import smooth_trajectory
 
 SIZE = (96, 72)
 INSIDE_M = ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))

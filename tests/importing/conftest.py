@@ -13,9 +13,9 @@ from captures import FLIP, FOCAL_PX, LENS, SIZE, Rendered
 from hypothesis import settings
 from recorded import Recording, record
 
-from mambaloc.data.rendering import Room, embedded_room, embedded_walk, render
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
+from mambaloc.rendering import Room, embedded_room, embedded_walk, render
 
 settings.register_profile("thorough", max_examples=2_000)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mambaloc.data.rendering import default_intrinsics, furnished_room, render, smooth_trajectory
+from mambaloc.rendering import default_intrinsics, furnished_room, render, smooth_trajectory
 
 SIZE = (64, 48)
 FRAMES = 6

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mambaloc.errors import InputError
-from mambaloc.importing.formats import FORMATS, read_capture
+from mambaloc.importing.registry import FORMATS, read_capture
 
 PICTURE = cv2.imencode(".png", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
 EYE12 = "1 0 0 0 0 1 0 0 0 0 1 0\n"

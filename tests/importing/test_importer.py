@@ -16,16 +16,16 @@ import pytest
 from captures import FOCAL_PX, SIZE
 from scipy.spatial.transform import Rotation
 
-from mambaloc.data.capture_scene import COLUMNS, read_rows, read_split
+from mambaloc.data.datasets.capture import COLUMNS, read_rows, read_split
 from mambaloc.data.frames import BadFrames
-from mambaloc.data.rendering import render
 from mambaloc.errors import InputError
 from mambaloc.images import read_image
 from mambaloc.importing.canonical import Imported
 from mambaloc.importing.capture import Camera
-from mambaloc.importing.formats import FORMATS, Format, read_capture
 from mambaloc.importing.importer import import_scene
-from mambaloc.importing.pictures import selected, write_pictures
+from mambaloc.importing.registry import FORMATS, Format, read_capture
+from mambaloc.importing.undistort.pictures import selected, write_pictures
+from mambaloc.rendering import render
 
 TOOL = Path(__file__).parents[2] / "tools" / "import_scene.py"
 
@@ -254,7 +254,7 @@ def test_a_source_that_breaks_leaves_nothing(rendered, tmp_path, monkeypatch):
 
 def test_the_first_format_that_matches_is_taken(rendered_once, monkeypatch):
     other = Format("anything", lambda source: True, lambda source: "read")
-    monkeypatch.setattr("mambaloc.importing.formats.FORMATS", {"other": other, **FORMATS})
+    monkeypatch.setattr("mambaloc.importing.registry.FORMATS", {"other": other, **FORMATS})
     assert read_capture(rendered_once.folder) == "read"
     assert read_capture(rendered_once.folder, "nerfstudio").kind == "nerfstudio"
 

@@ -7,10 +7,10 @@ import pytest
 import yaml
 
 from mambaloc.cli import main
-from mambaloc.data.rendering.layouts import write_cambridge
-from mambaloc.data.rendering.shots import FRAME_CAMBRIDGE, shots_of_sequences
-from mambaloc.data.rendering.trajectories import smooth_trajectory
 from mambaloc.models import create_model
+from mambaloc.rendering.scenes.layouts import write_cambridge
+from mambaloc.rendering.scenes.shots import FRAME_CAMBRIDGE, shots_of_sequences
+from mambaloc.rendering.trajectories import smooth_trajectory
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -13,7 +13,7 @@ import torch
 import yaml
 from safetensors.torch import save_file
 
-from mambaloc.data.rendering import default_intrinsics, embedded_room, embedded_shots, render
+from mambaloc.rendering import default_intrinsics, embedded_room, embedded_shots, render
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

@@ -1,0 +1,1 @@
+"""One file per dataset: how its splits are read; and the registry of them."""

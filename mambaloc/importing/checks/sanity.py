@@ -1,0 +1,172 @@
+"""What is sound about a capture and what is not: each check a line, and a verdict of them all."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mambaloc.geometry import is_rotation
+from mambaloc.importing.capture import Capture
+from mambaloc.importing.checks.findings import Finding
+from mambaloc.importing.motion import Motion, quaternions
+
+LEAST_FRAMES = 20
+_ROTATION_TOLERANCE = 1e-2
+_DUPLICATE_SHARE = 1e-6  # of the extent
+_DUPLICATE_DEG = 1e-3
+_MANY = 0.1
+_NAMED = 3
+
+
+def bad_poses(world_from_cam: NDArray[np.float64]) -> dict[int, str]:
+    """The rule that a frame's pose breaks, by row.
+
+    Args:
+        world_from_cam: (N, 4, 4).
+    """
+    found = {}
+    rotations = torch.from_numpy(world_from_cam[:, :3, :3].copy())
+    is_finite = np.isfinite(world_from_cam).all(axis=(1, 2))
+    is_right = is_rotation(rotations, tolerance=_ROTATION_TOLERANCE).numpy()
+    for row in np.flatnonzero(~(np.asarray(is_finite) & is_right)).tolist():
+        pose = world_from_cam[row]
+        found[row] = _broken(pose) if np.isfinite(pose).all() else "pose has NaN or infinite numbers"
+    return found
+
+
+def _broken(pose: NDArray[np.float64]) -> str:
+    rotation = pose[:3, :3]
+    determinant = float(np.linalg.det(rotation))
+    scale = abs(determinant) ** (1 / 3)
+    if scale < 1e-6 or not np.allclose(
+        rotation @ rotation.T, scale**2 * np.eye(3), atol=_ROTATION_TOLERANCE * scale**2
+    ):
+        return "pose's rotation is not orthonormal"
+    if determinant < 0:
+        return "pose's rotation is left-handed: an axis is mirrored"
+    return f"pose's rotation is scaled by {scale:.4g}"
+
+
+def check_frames(kept: int, left_out: Mapping[str, str]) -> Finding:
+    """Say how many frames there are, and what was left out of them.
+
+    Args:
+        kept: how many.
+        left_out: the rule that others break, by name.
+    """
+    rules = Counter(left_out.values())
+    said = f"{kept}" + "".join(f"; {count} left out: {rule}" for rule, count in rules.most_common(_NAMED))
+    figures = {"kept": kept, "left_out": dict(rules)}
+    if kept < LEAST_FRAMES:
+        concern = f"{kept} usable frames, and {LEAST_FRAMES} are needed to train on some and to test on others"
+        return Finding("frames", said, concern, is_fatal=True, figures=figures)
+    concern = ""
+    if left_out:
+        concern = f"{len(left_out)} of {kept + len(left_out)} frames are left out ({rules.most_common(1)[0][0]})"
+    return Finding("frames", said, concern, figures=figures)
+
+
+def check_missing(capture: Capture) -> Finding:
+    """Say which images have no pose and which poses no image."""
+    without_image, without_pose = capture.poses_without_image, capture.images_without_pose
+    said = f"{len(without_image)} without image, {len(without_pose)} images without pose"
+    if without_image:
+        said += f" ({_some(without_image)})"
+    listed = len(capture.images) + len(without_image)
+    concern = ""
+    if len(without_image) > _MANY * listed:
+        concern = f"{len(without_image)} of {listed} poses have no image"
+    elif len(without_pose) > len(capture.images):
+        concern = f"{len(without_pose)} images have no pose, more than have one"
+    figures = {"poses_without_image": len(without_image), "images_without_pose": len(without_pose)}
+    return Finding("poses", said, concern, figures=figures)
+
+
+def check_sizes(sizes: Sequence[tuple[int, int]], odd: int) -> Finding:
+    """Say how large the images are.
+
+    Args:
+        sizes: (width, height) of each.
+        odd: how many are of another shape than most, and are not used.
+    """
+    counted = Counter(sizes).most_common(_NAMED)
+    said = ", ".join(
+        f"{width}x{height}" + (f" ({count})" if len(counted) > 1 else "") for (width, height), count in counted
+    )
+    concern = f"{odd} images are shaped otherwise than most, and are not used" if odd else ""
+    figures = {"sizes": {f"{width}x{height}": count for (width, height), count in counted}, "of_another_shape": odd}
+    return Finding("image size", said, concern, figures=figures)
+
+
+def check_steps(capture: Capture, motion: Motion, unit: str) -> Finding:
+    """Say how far the camera moves from a frame to the next, and where it jumps."""
+    jumps = [capture.images[row].name for row in motion.jumps.tolist()]
+    figures = {
+        "median": round(motion.step, 6),
+        "median_deg": round(motion.step_deg, 3),
+        "in_order": motion.in_order,
+        "jumps": jumps,
+    }
+    if not motion.in_order:
+        said = f"no path; the nearest frame is {motion.step:.3g} {unit} and {motion.step_deg:.1f}° away (median)"
+        concern = "the frames are in no order of time: a split by blocks is one by place, and clips make no sense"
+        return Finding("steps", said, concern, figures=figures)
+    largest = f"{motion.length.max():.3g} {unit}"
+    said = f"median {motion.step:.3g} {unit} and {motion.step_deg:.1f}°, largest {largest}; {len(jumps)} jumps"
+    concern = f"the camera jumps {len(jumps)} times (to {_some(jumps)})" if jumps else ""
+    return Finding("steps", said, concern, figures=figures)
+
+
+def check_duplicates(capture: Capture, motion: Motion) -> Finding:
+    """Say how many frames have exactly the pose of another."""
+    grid = np.concatenate(
+        (
+            capture.world_from_cam[:, :3, 3] / max(_DUPLICATE_SHARE * motion.extent, 1e-12),
+            quaternions(capture) / np.radians(_DUPLICATE_DEG),
+        ),
+        axis=1,
+    ).round()
+    many = len(grid) - len(np.unique(grid, axis=0))
+    concern = (
+        f"{many} frames have exactly the pose of another: tracking may have stood still"
+        if many > _MANY * len(grid)
+        else ""
+    )
+    if many >= len(grid) - 1:
+        return Finding("duplicate poses", f"{many}", "all frames have the same pose", True, {"count": many})
+    return Finding("duplicate poses", f"{many}", concern, figures={"count": many})
+
+
+def check_extent(capture: Capture, motion: Motion, unit: str) -> Finding:
+    """Say how large the box around the camera centres is."""
+    position = capture.world_from_cam[:, :3, 3]
+    sides = np.ptp(position, axis=0)
+    said = f"{' x '.join(f'{side:.3g}' for side in sides)} {unit} along x, y, z"
+    figures = {"sides": sides.round(6).tolist(), "diagonal_of_nine_tenths": round(motion.extent, 6)}
+    return Finding("extent", said, figures=figures)
+
+
+def check_times(capture: Capture) -> Finding:
+    """Say whether time goes forward within each sequence."""
+    if capture.time_s is None:
+        return Finding("time", "not told by the format")
+    names = np.array(capture.sequences)
+    steps = np.diff(capture.time_s)[names[1:] == names[:-1]]
+    backwards, still = int((steps < 0).sum()), int((steps == 0).sum())
+    said = (
+        f"median {np.median(steps):.3g} s from frame to frame, longest {steps.max():.3g} s"
+        if len(steps)
+        else "one frame"
+    )
+    concern = ""
+    if backwards or still:
+        concern = f"time goes back {backwards} times and stands still {still} times from a frame to the next"
+    return Finding("time", said, concern, figures={"backwards": backwards, "still": still})
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")

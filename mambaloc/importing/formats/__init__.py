@@ -1,0 +1,1 @@
+"""Readers: one file per capture format, and what they share."""

@@ -1,0 +1,116 @@
+"""COLMAP models, text or binary, with any of its camera models.
+
+The model lies in ``SOURCE/sparse/0``, ``SOURCE/sparse`` or SOURCE itself, its images in ``SOURCE/images`` or beside.
+COLMAP's poses turn the world into the camera, in OpenCV's camera axes and an arbitrary scale; its pixels are counted
+from the corner of the top-left one, half a pixel more than here. Source: colmap.github.io/format.html and cameras.html
+there; poses and projections are pycolmap's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, is_sound, load_colmap
+from mambaloc.errors import InputError
+from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.formats.builder import CORNER_PX, LARGEST_PX, Posed, gathered, rigid
+from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures
+
+_PLACES = (*COLMAP_FOLDERS, ".")
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+
+
+def is_colmap(source: Path) -> bool:
+    """Whether a folder is, or holds, a COLMAP model."""
+    return colmap_folder(source, _PLACES) is not None
+
+
+def read_colmap(source: Path) -> Capture:
+    """Read the images of a model that have a pose there, and their cameras.
+
+    Raises:
+        InputError: without pycolmap, or for a model that is damaged, or whose images are not there.
+    """
+    path = colmap_folder(source, _PLACES)
+    if path is None:
+        raise InputError(f"{source}: holds no COLMAP model; give the folder of cameras, images and points3D")
+    model = load_colmap(path)
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: _key(image.name))
+    if not images:
+        raise InputError(f"{path}: places none of its {len(model.images)} images; reconstruct again")
+    files = _files(source, path, [image.name for image in images])
+    cam_from_world = np.array([image.cam_from_world().matrix() for image in images])
+    if not np.isfinite(cam_from_world).all():
+        raise InputError(f"{path}: has a pose with NaN or infinite numbers; export it again")
+    world_from_cam = np.linalg.inv(rigid(cam_from_world, lambda row: f"{path}, image {images[row].name[:80]!r}"))
+    cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(images)}
+    posed, missing = [], []
+    for image, file, pose in zip(images, files, world_from_cam, strict=True):
+        if file.is_file():
+            posed.append(Posed(file, _sequence(image.name, source), pose, f"camera-{image.camera_id}"))
+        else:
+            missing.append(image.name)
+    choices = {
+        "axes": "OpenCV camera axes, as COLMAP has them",
+        "direction": "world-to-camera in the file, inverted",
+        "scale": "unknown: COLMAP's is arbitrary",
+        "origin": "kept",
+        "model": path.relative_to(source).as_posix(),
+    }
+    beside = [picture for folder in dict.fromkeys(each.image.parent for each in posed) for picture in pictures(folder)]
+    return gathered(
+        "colmap", source, posed, unit="unknown", choices=choices, cameras=cameras, missing=missing, beside=beside
+    )
+
+
+def _key(name: str) -> tuple[tuple[int, str, int], ...]:
+    return natural(Path(name))
+
+
+def _used(images: list[Any]) -> list[int]:
+    return sorted({image.camera_id for image in images})
+
+
+def _files(source: Path, model: Path, names: list[str]) -> list[Path]:
+    """Where the images would be in the folder that holds most of them."""
+    folders = [source / "images", source]
+    if model == source:  # a model's own folder, such as sparse/0: images are beside sparse, too
+        root = source.resolve()
+        folders += [root.parent / "images", root.parent.parent / "images"]
+    candidates = [[inside(folder, name, f"{model}, images") for name in names] for folder in folders]
+    return max(candidates, key=lambda files: sum(file.is_file() for file in files))
+
+
+def _sequence(name: str, source: Path) -> str:
+    """The folder that an image's name tells, as recordings are kept apart; else the source's own."""
+    parent = Path(name.replace("\\", "/")).parent.as_posix()
+    return folder_name(source) if parent == "." else parent
+
+
+def _camera(camera: Any, path: Path) -> Camera:
+    if not is_sound(camera) or max(camera.width, camera.height) > LARGEST_PX:
+        raise InputError(f"{path}: holds a camera without a size or a finite, positive focal length; export it again")
+    model = str(camera.model_name)
+    return Camera(
+        int(camera.width),
+        int(camera.height),
+        (float(camera.focal_length_x), float(camera.focal_length_y)),
+        (float(camera.principal_point_x) - CORNER_PX, float(camera.principal_point_y) - CORNER_PX),
+        None if model in _PINHOLES else _distorted(camera),
+        model,
+    )
+
+
+def _distorted(camera: Any) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Pixels of rays by COLMAP's model; NaN for rays that it does not see."""
+
+    def distorted(rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        points: NDArray[np.float64] = np.column_stack([rays, np.ones(len(rays))])
+        return camera.img_from_cam(points) - CORNER_PX
+
+    return distorted

@@ -1,0 +1,226 @@
+"""Tables of poses: columns by their names in the first line, in any order.
+
+``scene,split,seq,img_path,t1,t2,t3,q1,q2,q3,q4`` is TransPoseNet's (Shavit et al. 2021,
+``datasets/CameraPoseDataset.py`` of github.com/yolish/transposenet), ``scene,split,image,x,y,z,qw,qx,qy,qz`` this
+project's; ``tx,ty,tz`` and a ``time`` are understood, too. The position is the camera centre, in metres in these two
+and an unknown unit in any other. The quaternion is what a dataset's own labels hold: in both tables of 7-Scenes
+camera-to-world, of Cambridge Landmarks **world-to-camera**, and no column says which. So it is taken as
+camera-to-world, unless a row is of a Cambridge scene: then the format must be named, ``csv_world_from_cam`` or
+``csv_cam_from_world``. ``q1`` to ``q4`` are scalar first in TransPoseNet's table, and refused in any other.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from mambaloc.errors import InputError
+from mambaloc.importing.capture import Capture, Unit
+from mambaloc.importing.formats.builder import Posed, from_quaternions, gathered
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, inside, pictures, read_text
+
+Direction = Literal["world_from_cam", "cam_from_world"]
+
+_IMAGE = ("image", "img_path", "image_path", "path", "file", "filename", "file_name", "image_name", "name")
+_POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("t1", "t2", "t3"))
+_QUATERNIONS = (("qw", "qx", "qy", "qz"), ("q1", "q2", "q3", "q4"))
+_TRANSPOSENET = (_POSITIONS[2], _QUATERNIONS[1])
+_SEQUENCE = ("seq", "sequence")
+_TIME = ("time", "time_s", "timestamp")
+_SPLITS = {"train": "train", "training": "train", "test": "test", "val": "val", "valid": "val", "validation": "val"}
+_CAMBRIDGE = ("KingsCollege", "OldHospital", "ShopFacade", "StMarysChurch", "GreatCourt", "Street")
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Which column holds what."""
+
+    image: str
+    position: tuple[str, ...]
+    quaternion: tuple[str, ...]
+    sequence: str | None
+    time: str | None
+
+
+Row = tuple[int, dict[str, str]]
+
+
+def is_csv(source: Path) -> bool:
+    """Whether a source is a CSV file, or a folder that holds one."""
+    return source.suffix.lower() == ".csv" or (source.is_dir() and any(source.glob("*.csv")))
+
+
+def read_csv(source: Path, direction: Direction | None = None) -> Capture:
+    """Read a table of one scene, whose image files lie by it.
+
+    Args:
+        source: the table, its folder, or a scene's folder beside a table of several.
+        direction: of the quaternions; camera-to-world unless the table is of a scene whose labels are not.
+
+    Raises:
+        InputError: for a table that is damaged or can be read in more ways than one.
+    """
+    path = _table(source)
+    columns, rows = _rows(path)
+    rows = _of_one_scene(source, path, rows)
+    _refuse_cambridge(path, rows, columns, direction)
+    numbers = [_numbers(path, line, row, columns) for line, row in rows]
+    table = np.array(numbers).reshape(len(rows), 7)
+
+    def where(row: int) -> str:
+        return f"{path}, line {rows[row][0]}"
+
+    world_from_cam, mended = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), where)
+    folder, images = _images(path, rows, columns)
+    posed, missing = [], []
+    for (line, row), image, pose in zip(rows, images, world_from_cam, strict=True):
+        if image.is_file():
+            sequence = row[columns.sequence] if columns.sequence else image.parent.relative_to(folder).as_posix()
+            time_s = None if columns.time is None else _time(path, line, row[columns.time])
+            name = sequence if sequence not in ("", ".") else folder_name(folder)
+            posed.append(Posed(image, name, pose, time_s=time_s, split=_split(path, line, row)))
+        else:
+            missing.append(row[columns.image])
+    is_known = columns.position == _POSITIONS[2] or (columns.position == _POSITIONS[0] and "scene" in rows[0][1])
+    choices = {
+        "axes": "OpenCV camera axes, as the datasets have them",
+        "direction": "world-to-camera, as --format says" if direction == "cam_from_world" else "camera-to-world",
+        "scale": "metres, as the datasets have them" if is_known else "unknown: the table does not tell",
+        "origin": "kept",
+    }
+    if mended:
+        choices["quaternions"] = f"{mended} of {len(rows)} were not of unit length, and made so"
+    beside = [image for parent in dict.fromkeys(each.image.parent for each in posed) for image in pictures(parent)]
+    kind = "csv" if direction is None else f"csv_{direction}"
+    unit: Unit = "metre" if is_known else "unknown"
+    return gathered(kind, path, posed, unit=unit, choices=choices, missing=missing, beside=beside)
+
+
+def _table(source: Path) -> Path:
+    if source.is_file():
+        return source
+    tables = sorted(source.glob("*.csv")) or sorted(source.resolve().parent.glob("*.csv"))
+    if len(tables) != 1:
+        names = ", ".join(table.name for table in tables[:8]) or "none"
+        raise InputError(f"{source}: holds not one CSV file but {names}; give the file itself")
+    return tables[0]
+
+
+def _rows(path: Path) -> tuple[_Columns, list[Row]]:
+    """The columns, and each row with its line."""
+    text = read_text(path, "a table of poses with its columns' names in the first line")
+    header = text.partition("\n")[0]
+    reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=header.count))
+    try:
+        names = [name.strip().lower() for name in next(reader, [])]
+        columns = _columns(path, names)
+        rows = []
+        for values in reader:
+            if len(values) != len(names) and values:
+                raise InputError(
+                    f"{path}, line {reader.line_num}: has {len(values)} fields where the first line names "
+                    f"{len(names)}; correct or remove it"
+                )
+            if values:
+                rows.append((reader.line_num, dict(zip(names, map(str.strip, values), strict=True))))
+    except csv.Error as error:
+        raise InputError(f"{path}, line {reader.line_num}: is no CSV ({error}); export it again") from None
+    if not rows:
+        raise InputError(f"{path}: has no row below its columns' names; add them")
+    return columns, rows
+
+
+def _columns(path: Path, names: Sequence[str]) -> _Columns:
+    def the_one(what: str, sets: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+        found = [each for each in sets if set(each) <= set(names)]
+        if len(found) != 1:
+            wanted = " or ".join(",".join(each) for each in sets)
+            raise InputError(
+                f"{path}, line 1: must name the {what} once ({wanted}); it names {','.join(names)[:200]!r}"
+            )
+        return found[0]
+
+    def at_most_one(what: str, known: Sequence[str]) -> str | None:
+        found = [name for name in known if name in names]
+        return the_one(what, [(name,) for name in known])[0] if found else None
+
+    twice = next((name for name in names if name and names.count(name) > 1), None)
+    if twice:
+        raise InputError(f"{path}, line 1: names the column {twice[:40]!r} twice; remove one")
+    columns = _Columns(
+        image=the_one("image file", [(name,) for name in _IMAGE])[0],
+        position=the_one("position", _POSITIONS),
+        quaternion=the_one("quaternion", _QUATERNIONS),
+        sequence=at_most_one("sequence", _SEQUENCE),
+        time=at_most_one("time", _TIME),
+    )
+    if columns.quaternion == _QUATERNIONS[1] and (columns.position, columns.quaternion) != _TRANSPOSENET:
+        raise InputError(f"{path}, line 1: q1,q2,q3,q4 do not say which is the scalar; name them qw,qx,qy,qz")
+    return columns
+
+
+def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
+    scenes = list(dict.fromkeys(row.get("scene", "") for _, row in rows))
+    if len(scenes) == 1:
+        return rows
+    chosen = [(line, row) for line, row in rows if source.is_dir() and row["scene"] == folder_name(source)]
+    if not chosen:
+        raise InputError(
+            f"{path}: holds the scenes {', '.join(scenes)[:200]}, each with a world of its own; give a table of one, "
+            f"or its folder beside the table with --format, as {path.with_name(scenes[0])!s:.200}"
+        )
+    return chosen
+
+
+def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction: Direction | None) -> None:
+    for line, row in rows:
+        first = row[columns.image].replace("\\", "/").partition("/")[0]
+        if direction is None and any(name in (row.get("scene"), first) for name in _CAMBRIDGE):
+            raise InputError(
+                f"{path}, line {line}: is of Cambridge Landmarks, whose labels turn the world into the camera; say "
+                "with --format csv_cam_from_world that these do, too, or with csv_world_from_cam that they do not"
+            )
+
+
+def _numbers(path: Path, line: int, row: dict[str, str], columns: _Columns) -> np.ndarray:
+    values = as_numbers([row[name] for name in (*columns.position, *columns.quaternion)])
+    if values is None or not np.isfinite(values).all():
+        names = ",".join((*columns.position, *columns.quaternion))
+        raise InputError(f"{path}, line {line}: {names} must be finite numbers; correct or remove the row")
+    return values
+
+
+def _turned(quaternion: np.ndarray, direction: Direction | None) -> np.ndarray:
+    return quaternion * (1, -1, -1, -1) if direction == "cam_from_world" else quaternion
+
+
+def _images(path: Path, rows: list[Row], columns: _Columns) -> tuple[Path, list[Path]]:
+    """The folder that the table's names are relative to, and each row's file there."""
+    names = [(row[columns.image], row.get("scene", ""), f"{path}, line {line}") for line, row in rows]
+    root = path.parent
+    candidates = [
+        (root, [inside(root, name, where) for name, _, where in names]),
+        (root / "images", [inside(root / "images", name, where) for name, _, where in names]),
+        (root, [inside(root, name.removeprefix(f"{scene}/"), where) for name, scene, where in names]),
+    ]
+    return max(candidates, key=lambda candidate: sum(image.is_file() for image in candidate[1]))
+
+
+def _split(path: Path, line: int, row: dict[str, str]) -> str | None:
+    if "split" not in row:
+        return None
+    if row["split"].lower() not in _SPLITS:
+        raise InputError(f"{path}, line {line}: split {row['split'][:40]!r} is none of train, val, test; correct it")
+    return _SPLITS[row["split"].lower()]
+
+
+def _time(path: Path, line: int, text: str) -> float:
+    value = as_numbers([text])
+    if value is None or not np.isfinite(value).all():
+        raise InputError(f"{path}, line {line}: time {text[:40]!r} is no number of seconds; correct it")
+    return float(value[0])

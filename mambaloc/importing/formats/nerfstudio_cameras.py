@@ -1,0 +1,165 @@
+"""Cameras of ``transforms.json``: one for all frames, or one a frame.
+
+Their pixels count from the image's corner: the centre of the top-left pixel is (0.5, 0.5), as in COLMAP.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mambaloc.errors import InputError
+from mambaloc.images import decode_image
+from mambaloc.importing.capture import Camera
+from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
+
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+KEYS = (
+    *("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"),
+    *_COEFFICIENTS,
+)
+"""What a file, or a frame of it, says of a camera."""
+
+_BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+_MOST_PIXELS = 32768
+_MOST_FOCAL_PX = 1e7
+_SAME_SHAPE = 0.01
+
+
+def read_cameras(
+    intrinsics: Sequence[Mapping[str, Any]], images: Sequence[Path], file: Path
+) -> tuple[dict[str, Camera], tuple[str, ...] | None, str]:
+    """Make a camera of each set of intrinsics that there is.
+
+    Args:
+        intrinsics: of N frames, by :data:`KEYS`.
+        images: their files, all there.
+        file: where they are told, for messages.
+
+    Returns:
+        Cameras by name, N names or None where nothing is told of any camera, and what was decided.
+
+    Raises:
+        InputError: for a camera that is none, is told of some frames alone, or is not of these images.
+    """
+    told = [any(key in each for key in ("fl_x", "camera_angle_x")) for each in intrinsics]
+    if not any(told):
+        return {}, None, "none: the file tells no focal length"
+    if not all(told):
+        raise InputError(f"{file}: tells a focal length of some frames, not of {images[told.index(False)]}; add it")
+    size = _first_size(images)
+    keys = [tuple(sorted((key, repr(value)) for key, value in each.items())) for each in intrinsics]
+    names = {key: f"camera-{count}" for count, key in enumerate(dict.fromkeys(keys), start=1)}
+    cameras: dict[str, Camera] = {}
+    for key, told_of, image in zip(keys, intrinsics, images, strict=True):
+        if names[key] not in cameras:
+            cameras[names[key]] = _camera(told_of, size, f"{file}: camera of {image.name}")
+    return cameras, tuple(names[key] for key in keys), _said(cameras, intrinsics[0], size)
+
+
+def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
+    """A finite number, or None where there is none.
+
+    Raises:
+        InputError: for anything else.
+    """
+    value = told.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+        raise InputError(f"{where}: {key} is {str(value)[:40]!r}, no finite number; correct it")
+    return float(value)
+
+
+def _camera(told: Mapping[str, Any], size: tuple[int, int], where: str) -> Camera:
+    """A camera in pixels of images of a size (width, height)."""
+    sides = [number(told, key, where) or size[axis] for axis, key in enumerate("wh")]
+    focal = [_focal(told, axis, sides[axis], where) for axis in (0, 1)]
+    focal_px = (focal[0], focal[1]) if focal[0] and focal[1] else (focal[0] or focal[1],) * 2
+    centre = [number(told, key, where) for key in ("cx", "cy")]
+    centre_px = [side / 2 if at is None else at for at, side in zip(centre, sides, strict=True)]
+    if not all(1 <= side <= _MOST_PIXELS for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
+        raise InputError(f"{where}: {sides[0]:g}x{sides[1]:g} pixels, focal length {focal_px[0]:g}: correct it")
+    if not all(-side < at < 2 * side for at, side in zip(centre_px, sides, strict=True)):
+        raise InputError(f"{where}: its centre {centre_px} is far outside of the image; correct it")
+    scale = _scale(sides, size, where)
+    width, height = round(sides[0] * scale), round(sides[1] * scale)
+    camera = Camera(
+        width,
+        height,
+        (focal_px[0] * width / sides[0], focal_px[1] * height / sides[1]),
+        (centre_px[0] * width / sides[0] - 0.5, centre_px[1] * height / sides[1] - 0.5),
+    )
+    return _with_lens(camera, told, where)
+
+
+def _focal(told: Mapping[str, Any], axis: int, side: float, where: str) -> float:
+    """Focal length along an axis in pixels, from the angle of view where that is told instead; 0 where neither is."""
+    key = "xy"[axis]
+    if focal_px := number(told, f"fl_{key}", where):
+        return focal_px
+    # Of an angle beside a focal length instant-ngp says only the same again.
+    angle_rad = number(told, f"camera_angle_{key}", where) if told.get("fl_x") is None else None
+    if angle_rad is None:
+        return 0.0
+    if not 0 < angle_rad < math.pi:
+        raise InputError(f"{where}: camera_angle_{key} is {angle_rad:g}, no angle of view in radians; correct it")
+    return side / 2 / math.tan(angle_rad / 2)
+
+
+def _scale(sides: Sequence[float], size: tuple[int, int], where: str) -> float:
+    """What shrinks a camera's image to the images that are there: nerfstudio ships smaller ones beside the originals.
+
+    Images that lie on their side are told apart when they are decoded.
+    """
+    for width, height in (size, size[::-1]):
+        scales = width / sides[0], height / sides[1]
+        if abs(scales[0] / scales[1] - 1) <= _SAME_SHAPE:
+            return scales[0]
+    raise InputError(
+        f"{where}: is of {sides[0]:g}x{sides[1]:g} images, and the first one that is there has {size[0]}x{size[1]}; "
+        "correct w and h"
+    )
+
+
+def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
+    coefficients = [number(told, key, where) or 0.0 for key in _COEFFICIENTS]
+    k1, k2, k3, k4, p1, p2 = coefficients
+    is_fisheye = bool(told.get("is_fisheye"))
+    model = told.get("camera_model") or (
+        "OPENCV_FISHEYE" if is_fisheye else "OPENCV" if any(coefficients) else "PINHOLE"
+    )
+    if model == "OPENCV_FISHEYE":
+        lens = opencv_fisheye(camera.focal_px, camera.centre_px, (k1, k2, k3, k4))
+        return replace(camera, distorted=lens, model=model)
+    if model not in _BROWN:
+        raise InputError(
+            f"{where}: camera_model {str(model)[:40]!r} is not read, only {', '.join(_BROWN)} and OPENCV_FISHEYE; "
+            "make pinhole images of it first"
+        )
+    if k4:
+        raise InputError(f"{where}: k4 is {k4:g}, which OpenCV's lens has not; give camera_model OPENCV_FISHEYE, or 0")
+    if not any(coefficients):
+        return replace(camera, model=model)
+    lens = opencv_lens(camera.focal_px, camera.centre_px, (k1, k2, p1, p2, k3))
+    return replace(camera, distorted=lens, model=model)
+
+
+def _first_size(images: Sequence[Path]) -> tuple[int, int]:
+    """Width and height of the first image that can be decoded."""
+    for path in images:
+        image = decode_image(path.read_bytes())
+        if not isinstance(image, str):
+            return image.shape[1], image.shape[0]
+    raise InputError(f"{images[0]}: neither it nor any other of {len(images)} images can be decoded; add them again")
+
+
+def _said(cameras: Mapping[str, Camera], told: Mapping[str, Any], size: tuple[int, int]) -> str:
+    first = next(iter(cameras.values()))
+    said = f"{len(cameras)}, {first.model}; the centre of the top-left pixel was (0.5, 0.5), and is (0, 0)"
+    if told.get("w") not in (None, *size):
+        said += f"; told of {told['w']:g}x{told['h']:g} images, scaled to {first.width}x{first.height}"
+    return said

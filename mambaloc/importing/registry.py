@@ -1,0 +1,69 @@
+"""Which formats there are, and which one a source is in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from mambaloc.errors import InputError
+from mambaloc.importing.capture import Capture
+from mambaloc.importing.formats import arkit, colmap, csv_table, kitti, nerfstudio, pose_folders, tum
+from mambaloc.importing.sfm import structure
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of capture.
+
+    Args:
+        looks_like: what a person sees, for messages.
+        matches: whether a source is in it, by the names of its files alone.
+        read: read it; raises :class:`InputError` that names the file, the rule and the remedy.
+    """
+
+    looks_like: str
+    matches: Callable[[Path], bool]
+    read: Callable[[Path], Capture]
+
+
+def _by_name_alone(source: Path) -> bool:
+    """Never: what cannot be told from a source is asked for with ``--format``."""
+    return False
+
+
+FORMATS: dict[str, Format] = {
+    "nerfstudio": Format("transforms.json of nerfstudio or instant-ngp", nerfstudio.matches, nerfstudio.read),
+    "record3d": Format("metadata and rgbd/ of Record3D", arkit.is_record3d, arkit.read_record3d),
+    "polycam": Format("keyframes/cameras/ and images/ of Polycam", arkit.is_polycam, arkit.read_polycam),
+    "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd),
+    "kitti": Format("poses/ and sequences/", kitti.is_kitti, kitti.read_kitti),
+    "scannet": Format("color/ and pose/", pose_folders.is_scannet, pose_folders.read_scannet),
+    "replica": Format("traj.txt and results/", pose_folders.is_replica, pose_folders.read_replica),
+    "colmap": Format("cameras, images and points3D", colmap.is_colmap, colmap.read_colmap),
+    "csv": Format("a .csv with columns image,x,y,z,qw,qx,qy,qz", csv_table.is_csv, csv_table.read_csv),
+    "csv_world_from_cam": Format("the same", _by_name_alone, partial(csv_table.read_csv, direction="world_from_cam")),
+    "csv_cam_from_world": Format("the same", _by_name_alone, partial(csv_table.read_csv, direction="cam_from_world")),
+    "tum": Format("a .tum or trajectory.txt beside images", tum.is_tum, tum.read_tum),
+    "kitti_poses": Format("a .kitti or poses.txt beside images", kitti.is_kitti_poses, kitti.read_kitti_poses),
+    "structure_from_motion": Format("a film or pictures alone", structure.is_pictures, structure.read_structure),
+}
+"""By name, the most telling first: the first that matches a source is taken."""
+
+
+def read_capture(source: Path, kind: str | None = None) -> Capture:
+    """Read a capture, in the format that its files look like unless one is named.
+
+    Raises:
+        InputError: where there is no such source or format, or it cannot be read.
+    """
+    if not source.exists():
+        raise InputError(f"{source}: there is no such file or folder; give a capture's")
+    if kind is not None and kind not in FORMATS:
+        raise InputError(f"--format {kind}: there is none; choose one of {', '.join(FORMATS)}")
+    kind = kind or next((name for name, known in FORMATS.items() if known.matches(source)), None)
+    if kind is None:
+        known = "; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
+        raise InputError(f"{source}: looks like no format that is known ({known}); name it with --format")
+    return FORMATS[kind].read(source)

@@ -1,0 +1,1 @@
+"""Structure from motion, for captures without poses."""

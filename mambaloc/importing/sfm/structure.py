@@ -1,0 +1,152 @@
+"""Pictures without poses, a film or a folder of photographs: posed by structure from motion.
+
+Frames of a film are chosen for sharpness and movement, and matched with their neighbours; of a few photographs every
+pair is. All pictures of one size share a camera with a radial distortion. The scale is arbitrary. What was made is kept
+in the user's cache and found again, unless the pictures change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from mambaloc.data.colmap import import_pycolmap
+from mambaloc.errors import InputError
+from mambaloc.images import read_image
+from mambaloc.importing.capture import Capture
+from mambaloc.importing.formats.colmap import read_colmap
+from mambaloc.importing.formats.parsing import first_with_pictures, folder_name, pictures
+from mambaloc.importing.sfm.frame_choice import choose_frames
+from mambaloc.importing.sfm.reconstruction import NEIGHBOURS, find_features, match_features, place_images, quiet_colmap
+from mambaloc.runtime.sources import SourceFrame, frames_of
+from mambaloc.user_cache import made_once
+
+FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
+"""Suffixes of files that are taken for films."""
+
+_VERSION = 1  # of what is kept: another one is made anew
+_MOST_PHOTOGRAPHS = 60  # every pair of so many is matched; a folder of more is taken for a film's frames
+_MOST_FRAMES = 400  # of a film: placing a hundred takes minutes
+_FEWEST_FRAMES = 5
+_LEAST_PLACED = 0.5
+_JPEG_QUALITY = 95
+_ADVICE = (
+    "film slowly and sideways rather than turning on the spot, with texture, light and little motion in view, and "
+    "return to where you began"
+)
+
+
+def is_pictures(source: Path) -> bool:
+    """Whether a source is a film, or a folder with pictures in it or in ``images``."""
+    if source.is_file():
+        return source.suffix.lower() in FILMS
+    return bool(pictures(source) or pictures(source / "images"))
+
+
+def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
+    """Choose frames, pose them, and read what was placed.
+
+    Args:
+        source: a film, or a folder of pictures.
+        threads: that finding and matching features take; -1 for all. What is found does not depend on it.
+        seed: of RANSAC.
+
+    Raises:
+        InputError: without pycolmap, where the source cannot be read, or too few frames could be placed.
+    """
+    import_pycolmap(source)
+    source = source if source.is_file() else first_with_pictures([source, source / "images"])
+    folder = made_once(f"structure/{_digest(source, seed)}", lambda partial: _make(source, partial, threads, seed))
+    note = json.loads((folder / "note.json").read_text(encoding="utf-8"))
+    capture = read_colmap(folder)
+    placed = set(capture.images)
+    name = source.stem if source.is_file() else folder_name(source)
+    kept = {"direction": "camera-to-world", "model": f"{folder.parent.name}/{folder.name} of the cache"}
+    return replace(
+        capture,
+        kind="structure_from_motion",
+        sequences=(name,) * len(capture.images),
+        choices={**capture.choices, **kept, **note["choices"]},
+        time_s=np.array([note["time_s"][image.name] for image in capture.images]) if note["time_s"] else None,
+        images_without_pose=tuple(image for image in pictures(folder / "images") if image not in placed),
+    )
+
+
+def _digest(source: Path, seed: int) -> str:
+    """Which pictures these are: by place, size and time of change, without reading them."""
+    digest = hashlib.sha256(f"{_VERSION} {seed} ".encode())
+    for path in [source] if source.is_file() else pictures(source):
+        status = path.stat()
+        digest.update(f"{path.resolve()}\0{status.st_size}\0{status.st_mtime_ns}\0".encode(errors="surrogateescape"))
+    return digest.hexdigest()[:16]
+
+
+def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
+    """Fill a folder with chosen images, the largest model of them, and a note of what was decided."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    images = folder / "images"
+    images.mkdir()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        frames, total = frames_of(source) if source.is_file() else _of_pictures(source)
+        is_film = source.is_file() or (total or 0) > _MOST_PHOTOGRAPHS
+        seen = iter(progress.track(frames, total=total, description="Choosing frames"))
+        time_s, sizes = _write(choose_frames(seen) if is_film else seen, images)
+        names = _thinned(images, sorted(time_s))
+        if len(names) < _FEWEST_FRAMES:
+            few = f"{len(names)} frames that differ, of {_FEWEST_FRAMES} at least"
+            raise InputError(f"{source}: shows {few}; {_ADVICE}")
+        with TemporaryDirectory(dir=folder) as work, quiet_colmap(source, _ADVICE):
+            database = Path(work) / "database.db"
+            progress.add_task("Finding features", total=None)
+            find_features(database, images, names, len(sizes) == 1, threads)
+            progress.add_task("Matching frames", total=None)
+            match_features(database, is_film, threads, seed)
+            task = progress.add_task("Placing frames", total=len(names))
+            placed = place_images(database, images, folder / "sparse/0", seed, lambda: progress.advance(task))
+    share = f"{placed} of {len(names)} frames"
+    if placed < max(_FEWEST_FRAMES, _LEAST_PLACED * len(names)):
+        raise InputError(f"{source}: only {share} could be placed, less than {_LEAST_PLACED:.0%}; {_ADVICE}")
+    chosen = f"{len(names)} of {progress.tasks[0].completed:.0f}, by sharpness and movement"
+    choices = {
+        "frames": chosen if is_film else f"all {len(names)} photographs",
+        "matching": f"{NEIGHBOURS} neighbours of each, and farther ones" if is_film else "every pair",
+        "registered": f"{share} ({placed / len(names):.0%})",
+    }
+    note = {"choices": choices, "time_s": {name: time_s[name] for name in names} if source.is_file() else {}}
+    (folder / "note.json").write_text(json.dumps(note, indent=2), encoding="utf-8")
+
+
+def _of_pictures(folder: Path) -> tuple[Iterator[SourceFrame], int]:
+    """A folder's pictures in natural order, as frames."""
+    paths = pictures(folder)
+    return (SourceFrame(str(at), float(at), read_image(path)) for at, path in enumerate(paths)), len(paths)
+
+
+def _write(frames: Iterable[SourceFrame], folder: Path) -> tuple[dict[str, float], set[tuple[int, ...]]]:
+    """Write frames as JPEG, named by their number in the source; their times by name, and their sizes."""
+    time_s, sizes = {}, set()
+    for frame in frames:
+        name = f"{int(frame.name):06d}.jpg"
+        _, data = cv2.imencode(".jpg", frame.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        (folder / name).write_bytes(data.tobytes())
+        time_s[name] = frame.time_s
+        sizes.add(frame.image.shape[:2])
+    return time_s, sizes
+
+
+def _thinned(folder: Path, names: list[str]) -> list[str]:
+    """Keep at most so many frames, evenly."""
+    rows = np.unique(np.linspace(0, len(names) - 1, min(_MOST_FRAMES, len(names))).round().astype(int))
+    kept = [names[row] for row in rows.tolist()]
+    for name in set(names) - set(kept):
+        (folder / name).unlink()
+    return kept

@@ -1,0 +1,1 @@
+"""Rendered frames on disk in the layouts of the public datasets, and the embedded scene."""

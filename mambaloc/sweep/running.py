@@ -1,0 +1,212 @@
+"""Run the cells of a matrix, each in its own process: one after another, or side by side on Ray."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from mambaloc.errors import InputError
+from mambaloc.sweep.cells import Cell, Matrix
+from mambaloc.sweep.progress import MatrixProgress
+from mambaloc.sweep.store import Store
+
+TRAIN = (sys.executable, "-m", "mambaloc.cli")
+_SUPERVISOR = Path(__file__).with_name("supervised.py")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a cell's process ended.
+
+    Args:
+        results: what each evaluation says, by epoch: ``metrics.json``, and ``frames``.
+        seconds: that the process took.
+        error: why it failed; None where it did not.
+    """
+
+    results: dict[str, dict[str, Any]]
+    seconds: float
+    error: str | None = None
+
+
+def run_matrix(matrix: Matrix, out: Path, address: str | None = None, retry_failed: bool = False) -> dict[str, int]:
+    """Run every cell that the store does not hold; the store learns of each as it ends.
+
+    Args:
+        matrix: what to run.
+        out: folder of the store, and of ``runs/``; on a cluster, one that every machine sees.
+        address: of a Ray cluster; without it a local Ray, or one cell after another where Ray is not installed.
+        retry_failed: also those that failed before.
+
+    Returns:
+        How many cells are ``done``, ``failed``, and were ``found`` in the store.
+
+    Raises:
+        InputError: where another process runs cells into the same folder, it cannot be written, or Ray is not there.
+    """
+    with Store(out) as store, _alone(out), _pool(matrix, address) as submit:
+        ended = store.read()
+        found = [ended[cell.key] for cell in matrix.cells if cell.key in ended]  # it may hold another matrix's too
+        kept = [cell for cell in found if cell.error is None or not retry_failed]
+        failed = {cell.key for cell in kept if cell.error is not None}
+        done = {cell.key for cell in kept} - failed
+        waiting = [cell for cell in matrix.cells if cell.key not in done | failed]
+        with MatrixProgress(matrix, kept) as progress:
+            running: dict[Future[Outcome], Cell] = {}
+            while waiting or running:
+                for cell in [cell for cell in waiting if set(cell.after) <= done | failed]:
+                    waiting.remove(cell)
+                    if lost := failed & set(cell.after):
+                        outcome = Outcome({}, 0.0, f"needs the run of a cell that failed ({min(lost)[:12]})")
+                        _keep(store, progress, cell, outcome, done, failed)
+                        continue
+                    folder = run_folder(out, cell.key).absolute()
+                    words = cell.command(partial(run_folder, out.absolute()))
+                    command = (*TRAIN, *words, "--trainer.default_root_dir", str(folder))
+                    running[submit(command, folder, matrix.time_limit_s, matrix.cpus)] = cell
+                    progress.started(cell)
+                for future in wait(running, return_when=FIRST_COMPLETED).done if running else ():
+                    _keep(store, progress, running.pop(future), _outcome(future), done, failed)
+    return {"done": len(done), "failed": len(failed), "found": len(kept)}
+
+
+def run_folder(out: Path, key: str) -> Path:
+    """Where a cell's training writes."""
+    return out / "runs" / key[:12]
+
+
+def run_cell(command: tuple[str, ...], run: Path, time_limit_s: float, cpus: float) -> Outcome:
+    """Train and evaluate in a process of its own; needs nothing of the caller's but its arguments.
+
+    Args:
+        command: that writes ``evaluation/*/metrics.json`` in the run's folder.
+        run: the folder; what an earlier try left there is removed.
+        time_limit_s: after which the process, and all that it started, is killed.
+        cpus: threads that it may use.
+    """
+    shutil.rmtree(run, ignore_errors=True)
+    run.mkdir(parents=True)
+    threads = str(max(1, int(cpus)))
+    environment = {**os.environ, "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
+    started = time.perf_counter()
+    with (run / "output.txt").open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, str(_SUPERVISOR), *command],
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            start_new_session=True,
+        )
+        try:
+            process.wait(time_limit_s)
+            error = _why(process.returncode, run / "output.txt")
+        except subprocess.TimeoutExpired:
+            error = f"took longer than {time_limit_s:g} s, and was stopped"
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+    seconds = time.perf_counter() - started
+    results = {
+        path.name: _result(path) for path in sorted(run.glob("evaluation/*")) if (path / "metrics.json").is_file()
+    }
+    if error is None and not results:
+        error = "ended without an evaluation"
+    return Outcome(results if error is None else {}, seconds, error)
+
+
+def _result(evaluation: Path) -> dict[str, Any]:
+    """What ``metrics.json`` says, and under ``frames`` each frame's image and errors, to compare systems by."""
+    result = json.loads((evaluation / "metrics.json").read_text(encoding="utf-8"))
+    with (evaluation / "predictions.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    errors = {name: [float(row[name]) for row in rows] for name in ("position_error_m", "rotation_error_deg")}
+    return {**result, "frames": {"image": [row["image"] for row in rows], **errors}}
+
+
+def _why(code: int, output: Path) -> str | None:
+    """Why a process failed: the last line that it said, or what killed it."""
+    if code == 0:
+        return None
+    if code in (-signal.SIGKILL, 128 + signal.SIGKILL):
+        return "was killed, as when memory runs out"
+    lines = [line.strip() for line in output.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1][:500] if lines else f"ended with code {code}, and said nothing"
+
+
+def _outcome(future: Future[Outcome]) -> Outcome:
+    try:
+        return future.result()
+    except Exception as error:  # of the machine that it ran on
+        return Outcome({}, 0.0, f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
+
+
+def _keep(
+    store: Store, progress: MatrixProgress, cell: Cell, outcome: Outcome, done: set[str], failed: set[str]
+) -> None:
+    store.write(cell, outcome.results, outcome.seconds, outcome.error)
+    (done if outcome.error is None else failed).add(cell.key)
+    progress.ended(cell, outcome.seconds, outcome.error)
+
+
+@contextlib.contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    lock = FileLock(out / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(f"{out}: another process runs cells into it; wait for it, or choose another --out") from None
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+Submit = Callable[[tuple[str, ...], Path, float, float], "Future[Outcome]"]
+
+
+@contextlib.contextmanager
+def _pool(matrix: Matrix, address: str | None) -> Iterator[Submit]:
+    """What runs cells: Ray where it is installed, else a thread that runs one at a time."""
+    if find_spec("ray") is None:
+        if address is not None:
+            raise InputError(f"--address {address}: needs Ray; pip install 'mambaloc[cluster]'")
+        with ThreadPoolExecutor(1) as pool:
+            yield lambda *arguments: pool.submit(run_cell, *arguments)
+        return
+    import ray
+
+    logging.getLogger("ray").setLevel(logging.ERROR)  # of itself it speaks of tokens and addresses
+    try:
+        ray.init(address=address, log_to_driver=False, include_dashboard=False, configure_logging=False)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise InputError(f"--address {address}: no Ray there ({str(error).splitlines()[0]}); start one") from None
+    for name, needed in (("CPU", matrix.cpus), ("GPU", matrix.gpus)):
+        if (there := ray.cluster_resources().get(name, 0)) < needed:
+            ray.shutdown()
+            raise InputError(f"{name.lower()}s: {needed:g} a cell, and Ray has {there:g}; lower it in the matrix")
+    remote = ray.remote(num_cpus=matrix.cpus, num_gpus=matrix.gpus, max_retries=0)(run_cell)
+    try:
+        yield lambda *arguments: remote.remote(*arguments).future()
+    finally:
+        ray.shutdown()

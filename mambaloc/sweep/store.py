@@ -1,0 +1,134 @@
+"""Where results are kept: one SQLite file, to which a finished cell is written in one transaction."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from mambaloc.errors import InputError
+from mambaloc.sweep.cells import Cell
+
+STORE_FILE = "results.sqlite"
+_TABLE = """
+CREATE TABLE IF NOT EXISTS cells (
+    key TEXT PRIMARY KEY,
+    labels TEXT NOT NULL,
+    words TEXT NOT NULL,
+    error TEXT,
+    results TEXT NOT NULL,
+    seconds REAL NOT NULL,
+    ended TEXT NOT NULL
+)
+"""
+
+
+@dataclass(frozen=True)
+class StoredCell:
+    """A cell that ended.
+
+    Args:
+        key: of the cell.
+        labels: its place on each axis.
+        words: of the command.
+        error: why it failed; None where it did not.
+        results: what each evaluation says, by epoch (``best``, ``last``): ``metrics.json``, and each frame's errors.
+        seconds: from its process's start to its end.
+        ended: when, ISO 8601, UTC.
+    """
+
+    key: str
+    labels: dict[str, str]
+    words: list[str]
+    error: str | None
+    results: dict[str, dict[str, Any]]
+    seconds: float
+    ended: str
+
+
+class Store:
+    """The results of a matrix in a folder; a context manager.
+
+    Args:
+        folder: holds ``results.sqlite``, and is made where there is none.
+
+    Raises:
+        InputError: where it cannot be written, or holds another kind of file of that name.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / STORE_FILE
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._database = sqlite3.connect(self.path)
+            with self._database:
+                self._database.execute(_TABLE)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
+        except sqlite3.OperationalError as error:
+            raise InputError(f"{self.path}: cannot be written ({error}); choose another --out") from None
+        except sqlite3.Error as error:
+            raise InputError(f"{self.path}: is no store of results ({error}); choose another --out") from None
+
+    @classmethod
+    def ended(cls, folder: Path) -> dict[str, StoredCell]:
+        """What :meth:`read` says of a folder's store; nothing where there is none, which is not made."""
+        if not (folder / STORE_FILE).is_file():
+            return {}
+        with cls(folder) as store:
+            return store.read()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._database.close()
+
+    def write(self, cell: Cell, results: dict[str, dict[str, Any]], seconds: float, error: str | None = None) -> None:
+        """Keep how a cell ended; what was kept of an earlier try is replaced.
+
+        Raises:
+            InputError: where it cannot be written; what it held, it holds.
+        """
+        ended = datetime.now(UTC).isoformat(timespec="seconds")
+        row = (
+            cell.key,
+            json.dumps(dict(cell.labels)),
+            json.dumps(cell.words),
+            error,
+            json.dumps(results),
+            seconds,
+            ended,
+        )
+        with self._told("free some space, and run the matrix again"), self._database:
+            self._database.execute("INSERT OR REPLACE INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+
+    def read(self) -> dict[str, StoredCell]:
+        """Every cell that ended, by key, in the order they did.
+
+        Raises:
+            InputError: where the file is damaged.
+        """
+        with self._told("put a copy in its place, or choose another --out"):
+            rows = self._database.execute(
+                "SELECT key, labels, words, error, results, seconds, ended FROM cells ORDER BY rowid"
+            ).fetchall()
+            return {
+                key: StoredCell(key, json.loads(labels), json.loads(words), error, json.loads(results), seconds, ended)
+                for key, labels, words, error, results, seconds, ended in rows
+            }
+
+    @contextmanager
+    def _told(self, remedy: str) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, ValueError, TypeError, RecursionError) as error:  # a damaged row is no JSON, or no text
+            raise InputError(f"{self.path}: cannot be used ({str(error).splitlines()[0]}); {remedy}") from None

@@ -1,0 +1,253 @@
+"""What a matrix's results come to: a row a place on the axes over its seeds, and differences on the same frames."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.evaluation.intervals import LEVEL, block_resamples
+from mambaloc.sweep.store import StoredCell
+
+SEED = "seed"
+"""The axis that rows are means over."""
+
+ALL = "all"
+"""The label, on the first axis, of a difference over all of its labels."""
+
+ERRORS = {"position_error_m": "m", "rotation_error_deg": "°"}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A mean over seeds of medians over frames, or a difference of two such, with its 95 % interval.
+
+    Args:
+        mean: over the seeds.
+        low: end of the interval, by bootstrap over blocks of frames, all seeds resampled alike.
+        high: likewise.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def is_sure(self) -> bool:
+        """Of a difference: whether its sign is that of the whole interval."""
+        return self.low > 0 or self.high < 0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One place on the axes.
+
+    Args:
+        labels: the place, its seed left out.
+        seeds: labels of the seeds that were run.
+        errors: a figure for each of ``ERRORS``.
+        train_s: seconds of training alone, a seed each.
+        steps: of training, a seed each.
+        train_frames: that it was trained on.
+        test_frames: that its errors are over.
+        data: dataset and scene, and whether they are the benchmark's own split.
+        selection: how the epoch was chosen.
+        references: medians of answers that need no training, by name.
+        cells: the results themselves, a seed each.
+    """
+
+    labels: dict[str, str]
+    seeds: tuple[str, ...]
+    errors: dict[str, Figure]
+    train_s: tuple[float, ...]
+    steps: tuple[int, ...]
+    train_frames: int
+    test_frames: int
+    data: str
+    selection: str
+    references: dict[str, dict[str, float]]
+    cells: tuple[dict[str, Any], ...]
+
+    @property
+    def beats_retrieval(self) -> bool | None:
+        """Of the position's median; None where retrieval was not measured."""
+        retrieval = self.references.get("retrieval")
+        return None if retrieval is None else self.errors["position_error_m"].mean < retrieval["position_error_m"]
+
+    def reached_s(self, error_m: float) -> tuple[float | None, ...]:
+        """Training seconds to a median position error, a seed each; None where it never got there."""
+        return tuple(reached_s(cell, error_m) for cell in self.cells)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What one label of an axis changes against another, all else equal, on the same frames.
+
+    Args:
+        labels: the place, without the axis and the seed; ``ALL`` on the first axis for the mean over it.
+        errors: a figure for each of ``ERRORS``: negative where the change helps.
+        step_ratio: training seconds a step after the change to those before it, a pair each.
+        reach_ratio: steps to the worse of the two last errors, likewise; empty where no curve was kept.
+    """
+
+    labels: dict[str, str]
+    errors: dict[str, Figure]
+    step_ratio: tuple[float, ...]
+    reach_ratio: tuple[float, ...]
+
+
+def rows_of(cells: Iterable[StoredCell], epoch: str = "last") -> list[Row]:
+    """Put the cells of each place together; those that failed, or lack the epoch, are left out.
+
+    Args:
+        cells: of a store.
+        epoch: ``last`` or ``best``.
+    """
+    return [_row(labels, group, epoch) for labels, group in _places(cells, epoch, (SEED,))]
+
+
+def differences(
+    cells: Iterable[StoredCell], axis: str, before: str, after: str, epoch: str = "last"
+) -> list[Difference]:
+    """Compare two labels of an axis wherever both were run, seed by seed; then over all of the first axis.
+
+    Args:
+        cells: of a store.
+        axis: that differs.
+        before: its label that is compared with.
+        after: the other.
+        epoch: ``last`` or ``best``.
+
+    Raises:
+        InputError: where the axis has no such label.
+    """
+    cells = list(cells)
+    for label in (before, after):
+        if not any(cell.labels.get(axis) == label for cell in cells):
+            raise InputError(f"--compare {axis}: no cell that ended has {label} there")
+    found = []
+    together: dict[tuple[tuple[str, str], ...], list[Pair]] = {}
+    for labels, group in _places(cells, epoch, (SEED, axis)):
+        if pairs := _pairs(group, axis, before, after, epoch):
+            found.append(_difference(labels, pairs))
+            (first, _), *others = labels.items()
+            together.setdefault(((first, ALL), *others), []).extend(pairs)
+    counts = [sum({**dict(place), first: ""} == {**each.labels, first: ""} for each in found) for place in together]
+    return found + [
+        _difference(dict(place), pairs)
+        for count, (place, pairs) in zip(counts, together.items(), strict=True)
+        if count > 1
+    ]
+
+
+def reached_s(result: dict[str, Any], error_m: float) -> float | None:
+    """Training seconds after which a validation's median position error was first so low; None if it never was."""
+    return next((each["train_s"] for each in history(result) if each["position_error_m"] <= error_m), None)
+
+
+def history(result: dict[str, Any]) -> list[dict[str, float]]:
+    """Step, training seconds and median errors of each validation; none where none was kept."""
+    return result["training"]["wall_clock"].get("history", [])
+
+
+def data_label(result: dict[str, Any]) -> str:
+    """Say which frames an error is over: the benchmark's own, rendered ones, or others."""
+    data, counts = result["data"], frame_counts(result)
+    if data["official_split"]:
+        return f"{data['dataset']}/{data['scene']}, official split"
+    kind = "rendered, not the benchmark" if data.get("rendered") else "no official split"
+    return f"{data['dataset']}/{data['scene']}, {kind} ({counts[0]} training and {counts[1]} test frames)"
+
+
+def frame_counts(result: dict[str, Any]) -> tuple[int, int]:
+    """Frames that the training and the test split list, before any is left out."""
+    return result["training"]["data"]["listed_frames"]["train"], result["data"]["listed_frames"]["test"]
+
+
+Pair = tuple[dict[str, Any], dict[str, Any]]
+
+
+def _pairs(group: list[StoredCell], axis: str, before: str, after: str, epoch: str) -> list[Pair]:
+    by_seed: dict[str, dict[str, dict[str, Any]]] = {}
+    for cell in group:
+        by_seed.setdefault(cell.labels.get(SEED, ""), {})[cell.labels[axis]] = cell.results[epoch]
+    return [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
+
+
+def _places(
+    cells: Iterable[StoredCell], epoch: str, without: Sequence[str]
+) -> list[tuple[dict[str, str], list[StoredCell]]]:
+    places: dict[tuple[tuple[str, str], ...], list[StoredCell]] = {}
+    for cell in cells:
+        if cell.error is None and epoch in cell.results:
+            place = tuple((axis, label) for axis, label in cell.labels.items() if axis not in without)
+            places.setdefault(place, []).append(cell)
+    order: dict[str, list[str]] = {}  # of labels as they come: cells that end side by side end in any order
+    for axis, label in itertools.chain.from_iterable(places):
+        order.setdefault(axis, []).append(label)
+    ranks = sorted(places, key=lambda place: [order[axis].index(label) for axis, label in place])
+    return [(dict(place), places[place]) for place in ranks]
+
+
+def _row(labels: dict[str, str], group: list[StoredCell], epoch: str) -> Row:
+    group = sorted(group, key=lambda cell: cell.labels.get(SEED, ""))
+    results = [cell.results[epoch] for cell in group]
+    first, rows = results[0], _resamples(results[0])
+    return Row(
+        labels=labels,
+        seeds=tuple(cell.labels.get(SEED, "") for cell in group),
+        errors={name: _figure([_medians(result, name, rows) for result in results]) for name in ERRORS},
+        train_s=tuple(result["training"]["wall_clock"]["train_s"] for result in results),
+        steps=tuple(result["training"]["step"] for result in results),
+        train_frames=first["training"]["data"]["train_frames"],
+        test_frames=first["count"],
+        data=data_label(first),
+        selection=first["selection"],
+        references=first["references"],
+        cells=tuple(results),
+    )
+
+
+def _resamples(result: dict[str, Any]) -> NDArray[np.int64]:
+    return block_resamples([image.rpartition("/")[0] for image in result["frames"]["image"]])
+
+
+def _medians(result: dict[str, Any], name: str, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The median over all frames, then those of each resample."""
+    errors = np.array(result["frames"][name])
+    return np.array([np.median(errors), *np.median(errors[rows], axis=1)])
+
+
+def _difference(labels: dict[str, str], pairs: list[Pair]) -> Difference:
+    errors = {}
+    resampled = [_resamples(before) for before, _ in pairs]  # alike for the same frames, apart for other scenes
+    for name in ERRORS:
+        told = [[_medians(result, name, rows) for result in pair] for pair, rows in zip(pairs, resampled, strict=True)]
+        errors[name] = _figure([after - before for before, after in told])
+    reach = tuple(ratio for pair in pairs if (ratio := _reach_ratio(pair)) is not None)
+    return Difference(labels, errors, tuple(_step_s(after) / _step_s(before) for before, after in pairs), reach)
+
+
+def _figure(medians: list[NDArray[np.float64]]) -> Figure:
+    mean = np.mean(medians, axis=0)
+    low, high = np.quantile(mean[1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Figure(float(mean[0]), float(low), float(high))
+
+
+def _step_s(result: dict[str, Any]) -> float:
+    return result["training"]["wall_clock"]["train_s"] / result["training"]["step"]
+
+
+def _reach_ratio(pair: Pair) -> float | None:
+    """Steps to an error that both got to, the worse of their last ones: after, to before."""
+    curves = [history(result) for result in pair]
+    if not all(curves):
+        return None
+    shared_m = max(curve[-1]["position_error_m"] for curve in curves)
+    before, after = (next(e["step"] for e in curve if e["position_error_m"] <= shared_m) for curve in curves)
+    return after / before

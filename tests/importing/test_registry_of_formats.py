@@ -1,0 +1,80 @@
+"""Detection: each format is taken for itself, a stranger for none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mambaloc.importing.registry import FORMATS, read_capture
+
+FILES = {
+    "record3d": ["metadata", "rgbd/0.jpg", "rgbd/0.depth"],
+    "polycam": ["keyframes/cameras/1.json", "keyframes/images/1.jpg", "mesh_info.json", "polycam.mp4"],
+    "tum_rgbd": ["rgb.txt", "depth.txt", "groundtruth.txt", "accelerometer.txt", "rgb/1.2.png"],
+    "kitti": ["poses/00.txt", "sequences/00/image_2/000000.png", "sequences/00/calib.txt"],
+    "scannet": ["color/0.jpg", "pose/0.txt", "depth/0.png", "intrinsic/intrinsic_color.txt"],
+    "replica": ["traj.txt", "results/frame000000.jpg", "results/depth000000.png"],
+    "colmap": ["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin", "images/a.jpg"],
+    "csv": ["poses.csv", "images/a.jpg"],
+    "tum": ["images/1.2.jpg", "trajectory.txt"],
+    "kitti_poses": ["images/1.jpg", "poses.txt"],
+    "structure_from_motion": ["a.jpg", "b.jpg", "notes.txt"],
+}
+ALSO = [
+    ("record3d", ["metadata.json", "rgb/0.png"]),
+    ("polycam", ["corrected_cameras/1.json", "corrected_images/1.jpg"]),
+    ("scannet", ["frames/color/0.jpg", "frames/pose/0.txt"]),
+    ("colmap", ["cameras.txt", "images.txt", "points3D.txt"]),
+    ("colmap", ["sparse/images.txt", "images/a.jpg"]),
+    ("tum", ["1.2.jpg", "run.tum"]),
+    ("kitti_poses", ["1.jpg", "run.kitti"]),
+    ("structure_from_motion", ["images/a.jpg"]),
+]
+
+
+def make(folder: Path, files: list[str]) -> Path:
+    for name in files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def detected(source: Path) -> str | None:
+    return next((name for name, known in FORMATS.items() if known.matches(source)), None)
+
+
+@pytest.mark.parametrize(("kind", "files"), [*FILES.items(), *ALSO])
+def test_each_format_is_taken_for_itself(tmp_path, kind, files):
+    assert detected(make(tmp_path, files)) == kind
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("csv", "a.csv"),
+        ("tum", "a.tum"),
+        ("kitti_poses", "a.kitti"),
+        ("record3d", "a.r3d"),
+        ("structure_from_motion", "a.MP4"),
+    ],
+)
+def test_files_are_told_by_their_suffix(tmp_path, kind, name):
+    assert detected(make(tmp_path, [name]) / name) == kind
+
+
+@pytest.mark.parametrize(
+    "files", [[], ["readme.txt"], ["a.pdf"], ["sparse/0/readme"], ["data/a.jpg"], ["poses/00.txt"], ["color/0.jpg"]]
+)
+def test_a_stranger_is_taken_for_none(tmp_path, refused, files):
+    assert detected(make(tmp_path, files)) is None
+    refused(read_capture, tmp_path, "looks like no format that is known")
+
+
+def test_every_format_is_tried_here():
+    others = {
+        "csv_world_from_cam",
+        "csv_cam_from_world",
+        "nerfstudio",
+    }  # asked for by name; tested in a file of its own
+    assert set(FILES) == set(FORMATS) - others

@@ -1,0 +1,101 @@
+"""Lenses against OpenCV and by hand, and pinholes without black borders."""
+
+import cv2
+import numpy as np
+import pytest
+
+from mambaloc.errors import InputError
+from mambaloc.importing.capture import Camera
+from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens, pinhole_of, sampled_at
+
+WIDTH, HEIGHT = 320, 240
+LENSES = {
+    "barrel": (-0.25, 0.06, 0.0, 0.0, 0.0),
+    "pincushion": (0.2, 0.05, 0.0, 0.0, 0.0),
+    "tangential": (-0.05, 0.01, 0.01, -0.008, 0.0),
+    "sixth power": (0.1, -0.2, 0.001, 0.0, 0.1),
+    "folds back": (-0.9, 0.1, 0.0, 0.0, 0.0),
+}
+
+
+def camera(coefficients, focal_px=(250.0, 240.0), centre_px=(150.0, 125.0), lens=opencv_lens):
+    return Camera(WIDTH, HEIGHT, focal_px, centre_px, lens(focal_px, centre_px, coefficients))
+
+
+def matrix_of(camera):
+    return np.array(
+        [[camera.focal_px[0], 0, camera.centre_px[0]], [0, camera.focal_px[1], camera.centre_px[1]], [0, 0, 1]]
+    )
+
+
+def test_a_lens_by_hand():
+    k1, k2, p1, p2, k3 = told = (0.1, -0.05, 0.01, -0.02, 0.03)
+    x, y = 0.3, -0.2
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    seen_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    seen_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    (found,) = camera(told).distorted(np.array([[x, y]]))
+    np.testing.assert_allclose(found, (250 * seen_x + 150, 240 * seen_y + 125), atol=1e-9)
+
+
+def test_a_fisheye_by_hand():
+    told = k1, k2, k3, k4 = (0.05, -0.02, 0.01, -0.005)
+    x, y = 0.8, 0.6
+    theta = np.arctan(np.hypot(x, y))
+    reach = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8) / np.hypot(x, y)
+    (found,) = camera(told, lens=opencv_fisheye).distorted(np.array([[x, y]]))
+    np.testing.assert_allclose(found, (250 * reach * x + 150, 240 * reach * y + 125), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_pinhole_shows_all_it_can_and_no_border(name):
+    lens = camera(LENSES[name])
+    pinhole = pinhole_of("a", lens)
+    assert (pinhole.width, pinhole.height, pinhole.centre_px) == (WIDTH, HEIGHT, lens.centre_px)
+    assert pinhole.distorted is None
+    assert pinhole.focal_px[0] / pinhole.focal_px[1] == pytest.approx(250 / 240)
+    columns, rows = sampled_at(lens, pinhole)
+    assert columns.min() > -0.02
+    assert rows.min() > -0.02
+    assert columns.max() < WIDTH - 1 + 0.02
+    assert rows.max() < HEIGHT - 1 + 0.02
+    # A little wider, and it would look past the border; or, where the lens folds back, see a place in the mirror.
+    wider = Camera(WIDTH, HEIGHT, tuple(0.97 * f for f in pinhole.focal_px), pinhole.centre_px)
+    columns, rows = sampled_at(lens, wider)
+    is_out = min(columns.min(), rows.min(), WIDTH - 1 - columns.max(), HEIGHT - 1 - rows.max()) < 0
+    by_row, by_column = (np.gradient(seen.astype(float)) for seen in (columns, rows))
+    assert is_out or (by_row[1] * by_column[0] <= by_row[0] * by_column[1]).any()
+
+
+@pytest.mark.parametrize("name", [name for name in LENSES if name != "folds back"])
+def test_pixels_come_from_where_opencv_takes_them(name):
+    lens = camera(LENSES[name])
+    pinhole = pinhole_of("a", lens)
+    expected = cv2.initUndistortRectifyMap(
+        matrix_of(lens), np.array(LENSES[name]), None, matrix_of(pinhole), (WIDTH, HEIGHT), cv2.CV_32FC1
+    )
+    np.testing.assert_allclose(sampled_at(lens, pinhole), expected, atol=1e-3)
+
+
+def test_pixels_of_a_fisheye_come_from_where_opencv_takes_them():
+    coefficients = (0.05, -0.02, 0.01, -0.005)
+    lens = camera(coefficients, (110.0, 110.0), lens=opencv_fisheye)
+    pinhole = pinhole_of("a", lens)
+    expected = cv2.fisheye.initUndistortRectifyMap(
+        matrix_of(lens), np.array(coefficients), None, matrix_of(pinhole), (WIDTH, HEIGHT), cv2.CV_32FC1
+    )
+    np.testing.assert_allclose(sampled_at(lens, pinhole), expected, atol=1e-3)
+
+
+def test_a_pinhole_stays_itself():
+    plain = Camera(WIDTH, HEIGHT, (200.0, 200.0), (160.0, 120.0))
+    assert pinhole_of("a", plain) is plain
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "centre_px"), [((1e9, 0, 0, 0, 0), (150.0, 125.0)), ((0.1, 0, 0, 0, 0), (-50.0, 125.0))]
+)
+def test_what_is_no_lens(coefficients, centre_px):
+    with pytest.raises(InputError, match="camera front: its distortion maps nothing into the image"):
+        pinhole_of("front", camera(coefficients, centre_px=centre_px))
