@@ -19,6 +19,9 @@ Image = NDArray[np.uint8]
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 """Suffixes of files that are taken for images."""
 
+LARGEST_SIDE_PX = 100_000
+"""Longest side of images, and of cameras that take them; a longer one is a mistake in a file."""
+
 END_BYTES = 4096
 """How far from a file's end its format's last marker may lie."""
 

@@ -17,6 +17,15 @@ Split = Literal["train", "val", "test"]
 """Imported scenes mark frames for validation; the benchmarks have none."""
 OnBadFrame = Literal["error", "skip"]
 
+FARTHEST_M = 1e7
+"""Largest coordinate of a position: beyond, float32 is off by a metre."""
+
+UNIT_TOLERANCE = 1e-3
+"""How far a quaternion's length may be from 1, where a file's decimals have rounded it."""
+
+ROTATION_TOLERANCE = 1e-2
+"""How far entries of ``R R^T`` may be from the identity's, where a file's decimals have rounded a rotation ``R``."""
+
 
 @dataclass(frozen=True)
 class Rejection:

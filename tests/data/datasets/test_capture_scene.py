@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.capture import COLUMNS, focal_ratio_of, is_captured, read_rows, read_split
-from mambaloc.data.datasets.registry import locate, scene_folder
-from mambaloc.data.download.origins import licence_of_weights
+from mambaloc.data.datasets.registry import licence_of_weights, locate, scene_folder
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
 from mambaloc.export import contract_of
