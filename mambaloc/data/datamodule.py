@@ -24,18 +24,15 @@ from mambaloc.data.augmentation import (
     draw_uniforms,
     turned,
 )
-from mambaloc.data.cached_dataset import CachedFrames
 from mambaloc.data.datasets.capture import describe_capture, focal_ratio_of
 from mambaloc.data.datasets.registry import CAPTURE, DATASETS, is_official, is_rendered, locate, scene_folder
+from mambaloc.data.frame_dataset import CachedFrames, LoadedSplit, describe_points, load_split
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
-from mambaloc.data.loaded_split import LoadedSplit, describe_points, load_split
 from mambaloc.data.points import read_points
 from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
 from mambaloc.errors import InputError
 from mambaloc.geometry import cropped_intrinsics
 from mambaloc.types import PoseBatch, height_and_width
-
-Part = Literal["train", "val", "test"]
 
 
 class PoseDataModule(L.LightningDataModule):
@@ -119,9 +116,9 @@ class PoseDataModule(L.LightningDataModule):
                 "follow the crop; leave it out, or say 'scene'"
             )
         self.jitter = Jitter(brightness, contrast, saturation)
-        self._loaded: dict[Part, LoadedSplit] = {}
+        self._loaded: dict[Split, LoadedSplit] = {}
         self._listed: dict[str, int] = {}
-        self._resident: dict[Part, CachedFrames] = {}
+        self._resident: dict[Split, CachedFrames] = {}
         self._uniforms: tuple[tuple[int, int, torch.device], Tensor] | None = None
 
     @property
@@ -162,7 +159,7 @@ class PoseDataModule(L.LightningDataModule):
         """
         return self._chosen()[0]
 
-    def frames(self, part: Part) -> Frames:
+    def frames(self, part: Split) -> Frames:
         """Return the frames of a part, in the order of ``PoseBatch.index``."""
         return self._loaded[part].data.frames
 
@@ -207,7 +204,7 @@ class PoseDataModule(L.LightningDataModule):
         """Test batches in order, for predictions without errors."""
         return self.test_dataloader()
 
-    def centred_images(self, part: Part, most: int | None = None) -> Iterator[Tensor]:
+    def centred_images(self, part: Split, most: int | None = None) -> Iterator[Tensor]:
         """Centre crops of a part's frames in the order of ``PoseBatch.index``, (B, 3, H, W) in 0..1.
 
         Args:
@@ -302,7 +299,7 @@ class PoseDataModule(L.LightningDataModule):
             raise InputError(f"data.validation marked: {self.folder} marks no frames as val; use auto, or none")
         return None
 
-    def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
+    def _loader(self, part: Split, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._data(part), self.trainer
         workers = 0 if data.resident is not None else self.hparams["num_workers"]
         # One sampler everywhere: Lightning gives it the epoch, so order depends on (seed, epoch) alone.
@@ -326,7 +323,7 @@ class PoseDataModule(L.LightningDataModule):
             persistent_workers=workers > 0,
         )
 
-    def _data(self, part: Part) -> CachedFrames:
+    def _data(self, part: Split) -> CachedFrames:
         """A part's frames, in the device's memory if they are to be there."""
         data, resident = self._loaded[part].data, self._resident.get(part)
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
