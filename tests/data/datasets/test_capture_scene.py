@@ -290,7 +290,7 @@ def test_crops_turn_by_the_scenes_own_focal_length(scene, tmp_path):
         data = module(scene, tmp_path, validation="none", batch_size=6, **values)
         data.setup("fit")
         data.trainer = type("Trainer", (), {"training": True, "current_epoch": 0, "world_size": 1, "global_rank": 0})()
-        batch = data._loaded["train"].data.__getitems__(list(range(6)))
+        batch = data.scene.parts["train"].data.__getitems__(list(range(6)))
         return data.on_after_batch_transfer(batch, 0).quaternion, batch.quaternion
 
     asked, plain = turned(focal_ratio="scene")
