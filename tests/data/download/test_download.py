@@ -32,7 +32,7 @@ from mambaloc.data.download.archives import require_space, unpack
 from mambaloc.data.download.fetch import fetch
 from mambaloc.errors import InputError
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 
 
 @dataclass
