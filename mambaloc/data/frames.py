@@ -17,8 +17,11 @@ Split = Literal["train", "val", "test"]
 """Imported scenes mark frames for validation; the benchmarks have none."""
 OnBadFrame = Literal["error", "skip"]
 
-FARTHEST_M = 1e7
-"""Largest coordinate of a position: beyond, float32 is off by a metre."""
+FARTHEST = 1e7
+"""Largest coordinate of a camera, in whatever unit a scene has: beyond, float32 is off by one unit."""
+
+FARTHEST_M = 1e5
+"""Largest coordinate in a place that is measured in metres: a label or a point beyond is an error or noise."""
 
 UNIT_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1, where a file's decimals have rounded it."""

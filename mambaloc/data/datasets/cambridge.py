@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from mambaloc.data.datasets.dataset import Archive, Dataset, Source
-from mambaloc.data.frames import UNIT_TOLERANCE, BadFrames, Frames, Rejection, Split
+from mambaloc.data.frames import FARTHEST_M, UNIT_TOLERANCE, BadFrames, Frames, Rejection, Split
 from mambaloc.errors import InputError
 from mambaloc.runtime.rotations import canonical, conjugate
 
@@ -38,7 +38,6 @@ KNOWN_BAD_LABELS = {
 
 _SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 _HEADER_LINES = 3
-_FARTHEST_M = 1e5  # no landmark is larger: the label is wrong
 
 
 def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
@@ -108,8 +107,8 @@ def _read_line(folder: Path, place: Path, words: list[str]) -> list[float] | Rej
         return Rejection(place, "names an image outside the scene's folder")
     if (folder.name, str(image.with_suffix(""))) in KNOWN_BAD_LABELS:
         return Rejection(folder / image, "is a known bad label of the dataset")
-    if not np.isfinite(numbers).all() or max(map(abs, numbers[:3])) > _FARTHEST_M:
-        return Rejection(place, f"has a position that is not finite or beyond {_FARTHEST_M:g} m")
+    if not np.isfinite(numbers).all() or max(map(abs, numbers[:3])) > FARTHEST_M:
+        return Rejection(place, f"has a position that is not finite or beyond {FARTHEST_M:g} m")
     if float(np.linalg.norm(numbers[3:])) < 0.5:
         return Rejection(place, "has a quaternion near zero")
     if not (folder / image).is_file():

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mambaloc.data.datasets.dataset import Dataset
-from mambaloc.data.frames import FARTHEST_M, UNIT_TOLERANCE, BadFrames, Frames, Split
+from mambaloc.data.frames import FARTHEST, UNIT_TOLERANCE, BadFrames, Frames, Split
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
 from mambaloc.images import LARGEST_SIDE_PX
@@ -207,8 +207,8 @@ def _row(folder: Path, told: dict[str, str], where: str) -> Row:
     if not all(math.isfinite(value) for value in values.values()):
         raise InputError(f"{where}: has NaN or infinite numbers; correct the row")
     pose = tuple(values[name] for name in numbers[:7])
-    if max(map(abs, pose[:3])) > FARTHEST_M:
-        raise InputError(f"{where}: lies farther than {FARTHEST_M:g} from the origin; shift the world towards it")
+    if max(map(abs, pose[:3])) > FARTHEST:
+        raise InputError(f"{where}: lies farther than {FARTHEST:g} from the origin; shift the world towards it")
     if abs(math.hypot(*pose[3:]) - 1) > UNIT_TOLERANCE:
         raise InputError(f"{where}: quaternion has length {math.hypot(*pose[3:]):.6g}, not 1; correct the row")
     return Row(image, told["sequence"], pose, told["camera"], told["split"])
