@@ -44,7 +44,7 @@ class Posed:
     split: str | None = None
 
 
-def gathered(
+def build_capture(
     kind: str,
     source: Path,
     posed: Sequence[Posed],
@@ -99,7 +99,7 @@ def gathered(
     )
 
 
-def rigid(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
+def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
     """Check transforms, and make rotations that were rounded in a text exact.
 
     Args:

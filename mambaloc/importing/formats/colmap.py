@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, is_sound, load_colmap
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import CORNER_PX, LARGEST_PX, Posed, gathered, rigid
+from mambaloc.importing.formats.builder import CORNER_PX, LARGEST_PX, Posed, build_capture, validate_se3
 from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures
 
 _PLACES = (*COLMAP_FOLDERS, ".")
@@ -47,7 +47,7 @@ def read_colmap(source: Path) -> Capture:
     cam_from_world = np.array([image.cam_from_world().matrix() for image in images])
     if not np.isfinite(cam_from_world).all():
         raise InputError(f"{path}: has a pose with NaN or infinite numbers; export it again")
-    world_from_cam = np.linalg.inv(rigid(cam_from_world, lambda row: f"{path}, image {images[row].name[:80]!r}"))
+    world_from_cam = np.linalg.inv(validate_se3(cam_from_world, lambda row: f"{path}, image {images[row].name[:80]!r}"))
     cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(images)}
     posed, missing = [], []
     for image, file, pose in zip(images, files, world_from_cam, strict=True):
@@ -63,7 +63,7 @@ def read_colmap(source: Path) -> Capture:
         "model": path.relative_to(source).as_posix(),
     }
     beside = [picture for folder in dict.fromkeys(each.image.parent for each in posed) for picture in pictures(folder)]
-    return gathered(
+    return build_capture(
         "colmap", source, posed, unit="unknown", choices=choices, cameras=cameras, missing=missing, beside=beside
     )
 
