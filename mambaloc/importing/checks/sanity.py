@@ -6,13 +6,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from mambaloc.geometry import is_rotation
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.findings import Finding
 from mambaloc.importing.motion import Motion, quaternions
+from mambaloc.runtime.rotations import is_rotation
 
 LEAST_FRAMES = 20
 _ROTATION_TOLERANCE = 1e-2
@@ -29,9 +28,8 @@ def bad_poses(world_from_cam: NDArray[np.float64]) -> dict[int, str]:
         world_from_cam: (N, 4, 4).
     """
     found = {}
-    rotations = torch.from_numpy(world_from_cam[:, :3, :3].copy())
     is_finite = np.isfinite(world_from_cam).all(axis=(1, 2))
-    is_right = is_rotation(rotations, tolerance=_ROTATION_TOLERANCE).numpy()
+    is_right = is_rotation(world_from_cam[:, :3, :3], _ROTATION_TOLERANCE)
     for row in np.flatnonzero(~(np.asarray(is_finite) & is_right)).tolist():
         pose = world_from_cam[row]
         found[row] = _broken(pose) if np.isfinite(pose).all() else "pose has NaN or infinite numbers"

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.geometry import is_rotation, matrix_from_pose, normalize, pose_from_matrix
 from mambaloc.importing.capture import Camera, Capture, Unit
-from mambaloc.types import Pose
+from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quaternion_from_matrix
 
 Matrices = NDArray[np.float64]
 
@@ -112,15 +110,12 @@ def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
     Raises:
         InputError: for a row that is no rigid transform.
     """
-    tensor = torch.from_numpy(matrices)
-    _refuse(
-        ~is_rotation(tensor[:, :3, :3], _ROTATION_TOLERANCE).numpy(), where, "the pose's rotation is not orthonormal"
-    )
+    rotation, position = matrices[:, :3, :3], matrices[:, :3, 3]
+    _refuse(~is_rotation(rotation, _ROTATION_TOLERANCE), where, "the pose's rotation is not orthonormal")
     if matrices.shape[1] == 4:
         is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
         _refuse(~is_last, where, "the pose's last row is not 0 0 0 1")
-    _refuse(np.abs(matrices[:, :3, 3]).max(axis=1) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
-    return matrix_from_pose(pose_from_matrix(tensor)).numpy()
+    return _transforms(matrix_from_quaternion(quaternion_from_matrix(rotation)), position, where)
 
 
 def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[int], str]) -> tuple[Matrices, int]:
@@ -140,9 +135,8 @@ def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
     _refuse(~((norm > 0.5) & (norm < 2)), where, "the quaternion is far from unit length")
-    _refuse(np.abs(position).max(axis=1, initial=0) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
-    pose = Pose(torch.from_numpy(position.copy()), normalize(torch.from_numpy(quaternion.copy())))
-    return matrix_from_pose(pose).numpy(), int((np.abs(norm - 1) > _UNIT_TOLERANCE).sum())
+    world_from_cam = _transforms(matrix_from_quaternion(quaternion), position, where)
+    return world_from_cam, int((np.abs(norm - 1) > _UNIT_TOLERANCE).sum())
 
 
 def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[float], where: str | Path) -> Camera:
@@ -167,6 +161,14 @@ def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[floa
             f"{width:.0f}x{height:.0f}; give the intrinsics of these images, not of others' size"
         )
     return Camera(int(width), int(height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
+
+
+def _transforms(rotation: Matrices, position: Matrices, where: Callable[[int], str]) -> Matrices:
+    """Homogeneous matrices of rotations (N, 3, 3) and positions (N, 3), which must not be too far away."""
+    _refuse(np.abs(position).max(axis=1, initial=0) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
+    matrices = np.tile(np.eye(4), (len(position), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = rotation, position
+    return matrices
 
 
 def _refuse(is_bad: Any, where: Callable[[int], str], rule: str) -> None:
