@@ -23,10 +23,9 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.importing.capture import Camera, Capture
+from mambaloc.images import CORNER_PX
+from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import (
-    CORNER_PX,
-    OPENCV_FROM_OPENGL,
     Posed,
     build_capture,
     from_quaternions,

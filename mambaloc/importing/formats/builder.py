@@ -11,22 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.importing.capture import Camera, Capture, Unit
+from mambaloc.images import LARGEST_SIDE_PX
+from mambaloc.importing.capture import ROTATION_TOLERANCE, Camera, Capture, Unit
 from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quaternion_from_matrix
 
 Matrices = NDArray[np.float64]
 
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Camera axes of OpenGL, ARKit and ARCore (x right, y up, z backwards) in OpenCV's, and the other way."""
-
-CORNER_PX = 0.5
-"""How far the corner of the top-left pixel is from its centre, where pixels are counted from here."""
-
-LARGEST_PX = 100_000
-"""Side of the largest images."""
-
-_FARTHEST = 1e9  # of any unit: more is no position
-_ROTATION_TOLERANCE = 1e-2
+_FARTHEST = 1e9  # in a file's own unit and world: the importer shifts worlds that are far from their origin
 _UNIT_TOLERANCE = 1e-3
 
 
@@ -111,7 +102,7 @@ def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
         InputError: for a row that is no rigid transform.
     """
     rotation, position = matrices[:, :3, :3], matrices[:, :3, 3]
-    _refuse(~is_rotation(rotation, _ROTATION_TOLERANCE), where, "the pose's rotation is not orthonormal")
+    _refuse(~is_rotation(rotation, ROTATION_TOLERANCE), where, "the pose's rotation is not orthonormal")
     if matrices.shape[1] == 4:
         is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
         _refuse(~is_last, where, "the pose's last row is not 0 0 0 1")
@@ -152,9 +143,12 @@ def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[floa
         InputError: for a size that is none, or numbers that no lens has.
     """
     width, height = size
-    is_size = all(1 <= side <= LARGEST_PX and side == int(side) for side in size)
+    is_size = all(1 <= side <= LARGEST_SIDE_PX and side == int(side) for side in size)
     if not is_size or not all(np.isfinite([*focal, *centre])) or min(focal) <= 0:
-        raise InputError(f"{where}: a camera must have a size and finite, positive focal lengths; export it again")
+        raise InputError(
+            f"{where}: a camera must have a size and finite, positive focal lengths, and at most {LARGEST_SIDE_PX} "
+            "pixels a side; export it again"
+        )
     if not (abs(centre[0] - width / 2) <= width / 4 and abs(centre[1] - height / 2) <= height / 4):
         raise InputError(
             f"{where}: principal point {centre[0]:.0f}, {centre[1]:.0f} is far from the centre of images of "

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, is_sound, load_colmap
 from mambaloc.errors import InputError
+from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import CORNER_PX, LARGEST_PX, Posed, build_capture, validate_se3
+from mambaloc.importing.formats.builder import Posed, build_capture, validate_se3
 from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures
 
 _PLACES = (*COLMAP_FOLDERS, ".")
@@ -93,8 +94,13 @@ def _sequence(name: str, source: Path) -> str:
 
 
 def _camera(camera: Any, path: Path) -> Camera:
-    if not is_sound(camera) or max(camera.width, camera.height) > LARGEST_PX:
+    if not is_sound(camera):
         raise InputError(f"{path}: holds a camera without a size or a finite, positive focal length; export it again")
+    if max(camera.width, camera.height) > LARGEST_SIDE_PX:
+        raise InputError(
+            f"{path}: a camera has {camera.width}x{camera.height} pixels, more than {LARGEST_SIDE_PX} a side. "
+            "Make smaller images, and reconstruct from these."
+        )
     model = str(camera.model_name)
     return Camera(
         int(camera.width),

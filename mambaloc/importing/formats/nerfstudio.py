@@ -18,8 +18,7 @@ from mambaloc.data.datasets.capture import MOST_FRAMES
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
 from mambaloc.images import PICTURES
-from mambaloc.importing.capture import Capture
-from mambaloc.importing.formats.builder import OPENCV_FROM_OPENGL
+from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
 from mambaloc.importing.formats.parsing import natural
 

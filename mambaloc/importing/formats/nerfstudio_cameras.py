@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mambaloc.errors import InputError
-from mambaloc.images import decode_image
+from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX, decode_image
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
 
@@ -24,7 +24,6 @@ KEYS = (
 """What a file, or a frame of it, says of a camera."""
 
 _BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
-_MOST_PIXELS = 32768
 _MOST_FOCAL_PX = 1e7
 _SAME_SHAPE = 0.01
 
@@ -81,7 +80,7 @@ def _camera(told: Mapping[str, Any], size: tuple[int, int], where: str) -> Camer
     focal_px = (focal[0], focal[1]) if focal[0] and focal[1] else (focal[0] or focal[1],) * 2
     centre = [number(told, key, where) for key in ("cx", "cy")]
     centre_px = [side / 2 if at is None else at for at, side in zip(centre, sides, strict=True)]
-    if not all(1 <= side <= _MOST_PIXELS for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
+    if not all(1 <= side <= LARGEST_SIDE_PX for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
         raise InputError(f"{where}: {sides[0]:g}x{sides[1]:g} pixels, focal length {focal_px[0]:g}: correct it")
     if not all(-side < at < 2 * side for at, side in zip(centre_px, sides, strict=True)):
         raise InputError(f"{where}: its centre {centre_px} is far outside of the image; correct it")
@@ -91,7 +90,7 @@ def _camera(told: Mapping[str, Any], size: tuple[int, int], where: str) -> Camer
         width,
         height,
         (focal_px[0] * width / sides[0], focal_px[1] * height / sides[1]),
-        (centre_px[0] * width / sides[0] - 0.5, centre_px[1] * height / sides[1] - 0.5),
+        (centre_px[0] * width / sides[0] - CORNER_PX, centre_px[1] * height / sides[1] - CORNER_PX),
     )
     return _with_lens(camera, told, where)
 

@@ -219,6 +219,7 @@ BAD = {
     "camera of a_1.png: k1 is 'True', no finite number": frame("k1", True),
     "focal length -5: correct it": frame("fl_x", -5),
     "1e+09x24 pixels": frame("w", 1e9),
+    "32767x24 pixels": frame("w", 32767),
     "is far outside of the image": frame("cx", 1e6),
     "is of 64x24 images, and the first one that is there has 32x24": frame("w", 64),
     "camera_angle_x is 4": lambda told: top(camera_angle_x=4)(without(told, "fl_x", "fl_y")),
