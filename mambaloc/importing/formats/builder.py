@@ -1,4 +1,4 @@
-"""From what a format says of its images to a capture: poses checked and made exactly rigid, images told apart."""
+"""Build a capture from what a format says of its images: poses and cameras are validated, and each image used once."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mambaloc.data.datasets.capture import MOST_FRAMES
 from mambaloc.errors import InputError
 from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.importing.capture import ROTATION_TOLERANCE, Camera, Capture, Unit
@@ -57,11 +58,13 @@ def build_capture(
         beside: images that are there, of which some may be among ``posed``.
 
     Raises:
-        InputError: where no image is left, or one is named twice.
+        InputError: for no image, one with two poses, or more than a scene may have.
     """
     if not posed:
         named = f"; {len(missing)} are named and missing, such as {missing[0]!r}" if missing else ""
         raise InputError(f"{source}: has no image with a pose{named}; add them")
+    if len(posed) > MOST_FRAMES:
+        raise InputError(f"{source}: lists {len(posed)} frames, more than {MOST_FRAMES}; keep fewer")
     used: set[Path] = set()
     for each in posed:
         if each.image in used:

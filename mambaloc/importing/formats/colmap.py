@@ -20,7 +20,7 @@ from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, validate_se3
-from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures
+from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures_beside
 
 _PLACES = (*COLMAP_FOLDERS, ".")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -63,7 +63,7 @@ def read_colmap(source: Path) -> Capture:
         "origin": "kept",
         "model": path.relative_to(source).as_posix(),
     }
-    beside = [picture for folder in dict.fromkeys(each.image.parent for each in posed) for picture in pictures(folder)]
+    beside = pictures_beside(each.image for each in posed)
     return build_capture(
         "colmap", source, posed, unit="unknown", choices=choices, cameras=cameras, missing=missing, beside=beside
     )

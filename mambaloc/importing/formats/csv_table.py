@@ -22,7 +22,7 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, inside, pictures, read_text
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, inside, pictures_beside, read_text
 
 Direction = Literal["world_from_cam", "cam_from_world"]
 
@@ -95,7 +95,7 @@ def read_csv(source: Path, direction: Direction | None = None) -> Capture:
     }
     if mended:
         choices["quaternions"] = f"{mended} of {len(rows)} were not of unit length, and made so"
-    beside = [image for parent in dict.fromkeys(each.image.parent for each in posed) for image in pictures(parent)]
+    beside = pictures_beside(each.image for each in posed)
     kind = "csv" if direction is None else f"csv_{direction}"
     unit: Unit = "metre" if is_known else "unknown"
     return build_capture(kind, path, posed, unit=unit, choices=choices, missing=missing, beside=beside)

@@ -30,33 +30,35 @@ _SAME_SHAPE = 0.01
 
 def read_cameras(
     intrinsics: Sequence[Mapping[str, Any]], images: Sequence[Path], file: Path
-) -> tuple[dict[str, Camera], tuple[str, ...] | None, str]:
-    """Make a camera of each set of intrinsics that there is.
+) -> tuple[dict[str, Camera], list[str | None], str]:
+    """Make a camera of each distinct set of intrinsics.
 
     Args:
         intrinsics: of N frames, by :data:`KEYS`.
         images: their files, all there.
-        file: where they are told, for messages.
+        file: that holds them, for messages.
 
     Returns:
-        Cameras by name, N names or None where nothing is told of any camera, and what was decided.
+        Cameras by name; the name of each frame's camera, None where the file has no focal lengths; what was decided.
 
     Raises:
-        InputError: for a camera that is none, is told of some frames alone, or is not of these images.
+        InputError: for intrinsics that no camera has, that are missing for some frames, or are of another image size.
     """
-    told = [any(key in each for key in ("fl_x", "camera_angle_x")) for each in intrinsics]
-    if not any(told):
-        return {}, None, "none: the file tells no focal length"
-    if not all(told):
-        raise InputError(f"{file}: tells a focal length of some frames, not of {images[told.index(False)]}; add it")
+    has_focal = [any(key in each for key in ("fl_x", "camera_angle_x")) for each in intrinsics]
+    if not any(has_focal):
+        return {}, [None] * len(images), "none: the file tells no focal length"
+    if not all(has_focal):
+        raise InputError(
+            f"{file}: tells a focal length of some frames, not of {images[has_focal.index(False)]}; add it"
+        )
     size = _first_size(images)
-    keys = [tuple(sorted((key, repr(value)) for key, value in each.items())) for each in intrinsics]
+    keys = [repr(sorted(each.items())) for each in intrinsics]
     names = {key: f"camera-{count}" for count, key in enumerate(dict.fromkeys(keys), start=1)}
     cameras: dict[str, Camera] = {}
-    for key, told_of, image in zip(keys, intrinsics, images, strict=True):
+    for key, each, image in zip(keys, intrinsics, images, strict=True):
         if names[key] not in cameras:
-            cameras[names[key]] = _camera(told_of, size, f"{file}: camera of {image.name}")
-    return cameras, tuple(names[key] for key in keys), _said(cameras, intrinsics[0], size)
+            cameras[names[key]] = _camera(each, size, f"{file}: camera of {image.name}")
+    return cameras, [names[key] for key in keys], _said(cameras, intrinsics[0], size)
 
 
 def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
