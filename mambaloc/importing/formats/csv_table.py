@@ -168,7 +168,8 @@ def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
     scenes = list(dict.fromkeys(row.get("scene", "") for _, row in rows))
     if len(scenes) == 1:
         return rows
-    chosen = [(line, row) for line, row in rows if source.is_dir() and row["scene"] == folder_name(source)]
+    scene = folder_name(source) if source.is_dir() else None
+    chosen = [(line, row) for line, row in rows if row["scene"] == scene]
     if not chosen:
         raise InputError(
             f"{path}: holds the scenes {', '.join(scenes)[:200]}, each with a world of its own; give a table of one, "
