@@ -10,7 +10,7 @@ import pytest
 from mambaloc.demo import build_site
 from mambaloc.export import write_bundle
 from mambaloc.runtime import Localiser
-from mambaloc.runtime.bundle import rotation_deg
+from mambaloc.runtime.rotations import rotation_error_deg
 from mambaloc.zoo.bundles import EMBEDDED, load_with_data
 
 pytestmark = pytest.mark.slow
@@ -51,7 +51,7 @@ def pose_of(page, count=1):
 def check(found, expected, mm=1.0, deg=0.1):
     position_m, quaternion = found
     assert 1000 * np.linalg.norm(position_m - expected.position_m) < mm
-    assert rotation_deg(quaternion, expected.quaternion) < deg
+    assert rotation_error_deg(quaternion, expected.quaternion) < deg
 
 
 def test_poses_of_the_frames_are_pythons(opened, bundle):
