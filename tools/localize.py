@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mambaloc.console import exits_cleanly, thread_count
 from mambaloc.runtime import Localiser
-from mambaloc.runtime.report import FILTERS, follow
+from mambaloc.runtime.video import FILTERS, follow
 
 
 @exits_cleanly
