@@ -58,7 +58,7 @@ def served():
 @contextmanager
 def _served(site, **options):
     with serve(site, 0, **options) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         try:
             yield server
         finally:
