@@ -11,20 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mambaloc.demo.site import node_modules
 from mambaloc.runtime import Localiser, Preprocessing
 from mambaloc.runtime.rotations import rotation_error_deg
 
 pytestmark = pytest.mark.slow
 HERE = Path(__file__).parent
 LOCALISER = resources.files("mambaloc.demo") / "web/localiser.js"
-
-
-@pytest.fixture(scope="module")
-def modules():
-    if shutil.which("npm") is None:
-        pytest.skip("needs Node.js, which is not here")
-    return node_modules(dev=True)
 
 
 @pytest.fixture(scope="module")
