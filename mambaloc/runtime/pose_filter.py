@@ -2,8 +2,8 @@
 
 An error-state Kalman filter (Solà 2017, *Quaternion kinematics for the error-state Kalman filter*): the state is
 position, velocity, rotation and angular velocity; its error is a vector of 12 whose rotation lies in the camera's own
-axes. The smoother goes back over what the filter found (Rauch, Tung and Striebel 1965). filterpy's filters know
-Euclidean states only, where a quaternion's four numbers are no error of three.
+axes. The smoother goes back over what the filter found (Rauch, Tung and Striebel 1965).
+filterpy is not used: its filters have Euclidean states only, and no error state for a rotation.
 
 A network errs alike on frames that look alike, so its errors are not white: filtering takes away jitter and leaps, but
 little of the error that neighbours share.
