@@ -41,7 +41,7 @@ class Trial:
         return " ".join(self.labels.values())
 
     def command(self, run_folder: Callable[[str], Path]) -> tuple[str, ...]:
-        """The arguments, each ``{axis=label}`` replaced by that trial's folder, which ``run_folder`` gives for its key."""
+        """The arguments, with each ``{axis=label}`` replaced by that trial's folder: ``run_folder`` of its key."""
         others = iter(self.after)
         return tuple(_OTHER_RUN.sub(lambda _: str(run_folder(next(others))), arg) for arg in self.args)
 

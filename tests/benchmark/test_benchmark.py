@@ -16,7 +16,7 @@ from mambaloc.models.base import mib
 
 
 def test_latency_is_timed_in_turns(monkeypatch):
-    monkeypatch.setattr(latency, "create_model", partial(create_model, backbone="resnet10t", width=16))
+    monkeypatch.setattr(latency, "create_model", partial(create_model, backbone="test_efficientnet", width=16))
     found = measure_latency(["student", "mapnet"], image_size=64, batches=(1, 2), repetitions=4)
     assert [(each.system, each.batch, each.what) for each in found] == [
         (system, batch, what)

@@ -26,6 +26,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.models import create_model
 
+TINY_BACKBONE = "test_efficientnet"  # timm's own for tests
 SMALL = {"dim": 32, "heads": 4, "encoder_layers": 2, "feedforward": 32, "head_hidden": 32}
 
 
@@ -39,7 +40,7 @@ def data(scenes):
 @pytest.fixture(scope="module")
 def setting(scenes):
     scene = {"dataset": "7scenes", "root": str(scenes), "image_size": 32, "short_side": 36, "batch_size": 4}
-    return Setting("mambaloc", {"backbone": "resnet10t", **SMALL}, {**scene, "validation": "sequences"})
+    return Setting("mambaloc", {"backbone": TINY_BACKBONE, **SMALL}, {**scene, "validation": "sequences"})
 
 
 @pytest.mark.parametrize("backbone", ["resnet10t", "mobilenetv3_small_050"])
@@ -81,7 +82,7 @@ def test_reference_decodes_what_the_cache_holds(data):
 
 def test_reference_learns(data):
     torch.manual_seed(0)
-    system = create_model("mambaloc", backbone="resnet10t", image_size=32, lr=1e-3, **SMALL)
+    system = create_model("mambaloc", backbone=TINY_BACKBONE, image_size=32, lr=1e-3, **SMALL)
     loop = ReferenceLoop(system, data, Published(system), 12, torch.device("cpu"), 0)
     losses = [loss for _ in range(4) for loss in loop.train()]
     assert len(losses) == 48
@@ -227,6 +228,6 @@ def test_a_training_that_reaches_nothing(data, trainer, message):
 
 
 def test_a_system_without_a_published_form_is_measured_beside_the_loop(setting):
-    student = Setting("student", {"backbone": "resnet10t", "width": 16}, setting.data)
+    student = Setting("student", {"backbone": TINY_BACKBONE, "width": 16}, setting.data)
     speed = measure_speed(student, batches=[], steps=2, repetitions=4, workers=0)
     assert set(speed.training) == {OURS, REFERENCE}

@@ -61,7 +61,7 @@ def test_wrong_scenes(tmp_path):
 @pytest.mark.slow
 def test_both_from_a_shell(scenes, cache, tool, capsys):
     """In processes of their own; the tests above guard what they measure."""
-    tool("scenes", scenes, "heads", "--short-side", 36)
+    tool("benchmarks/scenes", scenes, "heads", "--short-side", 36)
     assert "heads" in capsys.readouterr().out
-    tool("loading", "--dataset", "7scenes", "--root", scenes)
+    tool("benchmarks/loading", "--dataset", "7scenes", "--root", scenes)
     assert "ratio" in capsys.readouterr().out

@@ -58,7 +58,7 @@ def test_a_training_is_watched(tmp_path, capsys):
 def test_a_recipe_from_a_shell(tiny_recipe, tmp_path, tool, capsys):
     """A training in a process of its own, to its end and with its mistakes; the tests beside guard each by itself."""
     out = tmp_path / "out"
-    tool("soak", tiny_recipe, "--steps", 40, "--out", out)
+    tool("benchmarks/soak", tiny_recipe, "--steps", 40, "--out", out)
     assert "open files" in capsys.readouterr().out
     check_samples(soak.read_samples(out / "samples.jsonl"), list(range(1, 41)))
     assert (out / "run/checkpoints/last.ckpt").is_file()

@@ -18,7 +18,6 @@ from uncertainty_methods import (
 )
 from uncertainty_report import print_certainty, write_certainty
 
-from mambaloc.cli import main
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical
@@ -64,7 +63,7 @@ def systems(scenes):
         torch.manual_seed(seed)
         data = PoseDataModule("7scenes", str(scenes), "heads", 32, 36, validation="sequences", batch_size=4)
         data.setup("fit")
-        system = create_model("mambaloc", backbone="resnet10t", image_size=32, **small)
+        system = create_model("mambaloc", backbone="test_efficientnet", image_size=32, **small)
         system.provenance = {"data": data.describe()}
         found.append((system, data))
     return found
@@ -117,14 +116,7 @@ def test_one_checkpoint_and_no_other_place(systems, tmp_path, capsys):
         measure_certainty({"a": systems[0]}, tmp_path / "none")
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_checkpoints_from_a_shell(tiny_recipe, tmp_path, tool, capsys):
-    """Two trainings; the tests above guard what is measured of them."""
-    for seed in ("0", "1"):
-        options = ["--seed_everything", seed, "--trainer.max_epochs", "1"]
-        main([str(tiny_recipe), *options, "--trainer.default_root_dir", str(tmp_path / seed)])
-    checkpoints = [tmp_path / seed / "checkpoints/last.ckpt" for seed in ("0", "1")]
-    tool("uncertainty", *checkpoints, "--out", tmp_path / "out")
-    assert "ensemble of 2" in capsys.readouterr().out
+def test_a_checkpoint_from_a_shell(trained, tmp_path, tool, capsys):
+    tool("benchmarks/uncertainty", trained / "checkpoints/last.ckpt", "--out", tmp_path / "out")
+    assert "shifted crops" in capsys.readouterr().out
     assert (tmp_path / "out/uncertainty.json").is_file()
