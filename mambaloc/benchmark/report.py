@@ -17,7 +17,7 @@ from mambaloc.benchmark.loading import LoadingRates
 from mambaloc.benchmark.scenes import SceneCost
 from mambaloc.benchmark.sizes import UNEXPLAINED, Size
 from mambaloc.export.quantisation import LARGEST_LOSS
-from mambaloc.models.base import mib
+from mambaloc.models.weights import mib
 
 NOT_SHIPPED = f"\n* loses more than {LARGEST_LOSS:.0%} of its median error, so no bundle holds it"
 

@@ -17,7 +17,7 @@ from mambaloc.benchmark.sizes import UNEXPLAINED
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.models import create_model
-from mambaloc.models.base import mib
+from mambaloc.models.weights import mib
 
 
 def test_loading_is_timed_both_ways(scenes):
