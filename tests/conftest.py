@@ -1,66 +1,143 @@
-"""Data that every test may use: a tiny rendered scene, and recipes small enough to train in seconds."""
+"""Data that every test may use: a tiny rendered scene, small recipes, and what trainings and exports of them leave.
+
+What costs seconds is made once a session, by whichever worker needs it first, and is read only: a test that changes a
+file copies the folder to its own ``tmp_path``.
+"""
 
 import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+import yaml
+from filelock import FileLock
+from hypothesis import settings
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # each worker a core of its own; read when torch is imported
 
+settings.register_profile("ci", max_examples=25, deadline=None)
+settings.register_profile("nightly", max_examples=1000, deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+TINY_BACKBONE = "test_efficientnet"
+"""timm's own network for tests: 82,000 parameters, feature maps at strides 2 to 32."""
+
+TINY_MAMBALOC = {
+    "backbone": TINY_BACKBONE, "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "head_hidden": 16,
+    "lr": 0.001, "lr_step_epochs": 2, "normalise_position": True,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """``made_once(name, make)``: the folder of that name, which ``make(folder)`` fills once for all xdist workers."""
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    shared.mkdir(exist_ok=True)
+
+    def make_once(name: str, make: Callable[[Path], object]) -> Path:
+        folder, done = shared / name, shared / f"{name}.done"
+        with FileLock(shared / f"{name}.lock"):
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                done.touch()
+        return folder
+
+    return make_once
+
 
 @pytest.fixture(scope="session", autouse=True)
-def cache_dir(tmp_path_factory):
+def cache_dir(made_once):
     """A cache of the session's own, seen by subprocesses too: tests neither use nor fill the user's."""
-    folder = tmp_path_factory.mktemp("cache")
+    folder = made_once("cache", lambda folder: None)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MAMBALOC_CACHE", str(folder))
         yield folder
 
 
 @pytest.fixture(scope="session")
-def scenes(tmp_path_factory):
+def scenes(made_once):
     """A folder of rendered scenes in the 7-Scenes layout; ``heads`` has 2 x 12 training and 8 test frames."""
     from mambaloc.rendering.scenes.layouts import write_7scenes
     from mambaloc.rendering.scenes.shots import shots_of_sequences
     from mambaloc.rendering.trajectories import smooth_trajectory
 
-    root = tmp_path_factory.mktemp("scenes")
-    inside_m = ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))
-    sequences = {n: smooth_trajectory(8 if n == 3 else 12, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
-    write_7scenes(root, "heads", shots_of_sequences(sequences, {3}), size=(96, 72), depth=True)
-    return root
+    def render(root: Path) -> None:
+        inside_m = ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))
+        sequences = {n: smooth_trajectory(8 if n == 3 else 12, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
+        write_7scenes(root, "heads", shots_of_sequences(sequences, {3}), size=(96, 72), depth=True)
+
+    return made_once("scenes", render)
+
+
+def write_recipe(path: Path, scenes: Path, model: dict, data: dict, **trainer) -> Path:
+    """Write a recipe that trains a system on ``scenes``."""
+    recipe = {
+        "model": model,
+        "data": {"root": str(scenes), "scene": "heads", "image_size": 32, "short_side": 36, "batch_size": 4, **data},
+        "trainer": {"accelerator": "cpu", **trainer},
+        "onnx_export": {"enabled": False},
+    }
+    path.write_text(yaml.safe_dump(recipe))
+    return path
 
 
 @pytest.fixture
 def tiny_recipe(scenes, tmp_path):
     """A recipe that trains on ``scenes`` in about a second an epoch; its runs go under ``tmp_path``."""
-    recipe = tmp_path / "tiny.yaml"
-    recipe.write_text(
-        f"""
-model:
-  class_path: LitMambaLoc
-  init_args:
-    backbone: resnet10t
-    dim: 16
-    heads: 2
-    encoder_layers: 1
-    feedforward: 16
-    head_hidden: 16
-    lr: 0.001
-    lr_step_epochs: 2
-    normalise_position: true
-data:
-  root: {scenes}
-  scene: heads
-  image_size: 32
-  short_side: 36
-  batch_size: 4
-  validation: sequences
-trainer:
-  max_epochs: 4
-  accelerator: cpu
-onnx_export:
-  enabled: false
-"""
-    )
-    return recipe
+    model = {"class_path": "LitMambaLoc", "init_args": TINY_MAMBALOC}
+    return write_recipe(tmp_path / "tiny.yaml", scenes, model, {"validation": "sequences"}, max_epochs=4)
+
+
+@pytest.fixture(scope="session")
+def trained(made_once, scenes):
+    """The folder of a tiny MambaLoc's run of three epochs, validated on a sequence: every file that a run leaves."""
+    from mambaloc.cli import main
+
+    def train(folder: Path) -> None:
+        model = {"class_path": "LitMambaLoc", "init_args": TINY_MAMBALOC}
+        recipe = write_recipe(folder / "recipe.yaml", scenes, model, {"validation": "sequences"}, max_epochs=3)
+        options = ["--onnx_export.enabled", "true", "--trainer.default_root_dir", str(folder / "run")]
+        main([str(recipe), *options])
+
+    return made_once("trained", train) / "run"
+
+
+@pytest.fixture(scope="session")
+def trained_student(made_once, scenes):
+    """The folder of a tiny student's run of one epoch without validation; ``recipe.yaml`` lies in it."""
+    from mambaloc.cli import main
+
+    def train(folder: Path) -> None:
+        model = {"class_path": "LitStudent", "init_args": {"backbone": TINY_BACKBONE, "width": 16}}
+        recipe = write_recipe(folder / "recipe.yaml", scenes, model, {"validation": "none"}, max_epochs=1)
+        main([str(recipe), "--trainer.default_root_dir", str(folder)])
+
+    return made_once("trained_student", train)
+
+
+@pytest.fixture(scope="session")
+def bundle_of_tensors(made_once, trained_student):
+    """A bundle of the tiny student: float32, float16 and ORT models that take normalised tensors."""
+    return _bundle(made_once, "bundle_of_tensors", trained_student, raw_input=False)
+
+
+@pytest.fixture(scope="session")
+def bundle_of_pictures(made_once, trained_student):
+    """The same, with resizing, cropping and scaling inside the models."""
+    return _bundle(made_once, "bundle_of_pictures", trained_student, raw_input=True)
+
+
+def _bundle(made_once, name: str, run: Path, raw_input: bool) -> Path:
+    from mambaloc.export import write_bundle
+    from mambaloc.zoo.bundles import load_with_data
+
+    def export(folder: Path) -> None:
+        system, data = load_with_data(str(run / "checkpoints/last.ckpt"))
+        write_bundle(system, data, folder / "bundle", ("onnx", "fp16", "ort"), raw_input=raw_input)
+
+    return made_once(name, export) / "bundle"
