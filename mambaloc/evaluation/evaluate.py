@@ -134,5 +134,5 @@ def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, trained: Tr
         write_csv(out / "predictions.csv", table, frames)
         write_tum(out / "predictions.tum", table.index.tolist(), table.predicted_position_m, table.predicted_quaternion)
         write_tum(out / "ground_truth.tum", table.index.tolist(), table.true_position_m, table.true_quaternion)
-        title = f"{result['model']['name']} on {result['data']['scene']}, test, {trained.epoch} epoch"
+        title = f"{result['model']['name']} on {result['data']['scene']}, test, {trained.chosen} epoch"
         draw_trajectory(table, frames.sequences, out / "trajectory.png", title)

@@ -25,14 +25,14 @@ class Trained:
         return f"{self.system.registry_name} {_GIS[self.system.hparams['gis']]}"
 
     @property
-    def epoch(self) -> str:
+    def chosen(self) -> str:
         """How its epoch was chosen, in a word or two."""
         return self.checkpoint.selection.split(":")[0]
 
     @property
     def run(self) -> str:
         """Which epoch of which run."""
-        return f"{self.epoch} epoch, seed {self.checkpoint.provenance.get('seed')}"
+        return f"{self.chosen} epoch, seed {self.checkpoint.provenance.get('seed')}"
 
 
 def load_trained(checkpoint: Checkpoint, data: PoseDataModule | None = None) -> Trained:

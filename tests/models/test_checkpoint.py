@@ -58,12 +58,12 @@ def test_how_the_epoch_was_chosen(best, trained):
 
 
 def test_the_training_is_described(best, trained):
-    told = best.describe()
-    assert told["epoch"] == best.stored["epoch"] + 1
-    assert told["checkpoint_sha256"] == hashlib.sha256(best.path.read_bytes()).hexdigest()
-    assert told["recipe_sha256"] == hashlib.sha256((trained / "config.yaml").read_bytes()).hexdigest()
-    assert told["wall_clock"]["train_s"] > 0
-    assert len(told["wall_clock"]["history"]) == told["epoch"]
+    description = best.describe()
+    assert description["epoch"] == best.stored["epoch"] + 1
+    assert description["checkpoint_sha256"] == hashlib.sha256(best.path.read_bytes()).hexdigest()
+    assert description["recipe_sha256"] == hashlib.sha256((trained / "config.yaml").read_bytes()).hexdigest()
+    assert description["wall_clock"]["train_s"] > 0
+    assert len(description["wall_clock"]["history"]) == description["epoch"]
     assert replace(best, stored={**best.stored, "callbacks": {}}).wall_clock is None
 
 
