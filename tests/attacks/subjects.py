@@ -19,8 +19,9 @@ from mambaloc.evaluation import evaluate_checkpoint
 from mambaloc.export import contract_of, export_onnx, write_bundle
 from mambaloc.images import read_image
 from mambaloc.importing.importer import import_scene
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models import Checkpoint
 from mambaloc.models.student import LitStudent
+from mambaloc.models.weights import read_checkpoint
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.trajectory import write_tum
@@ -115,7 +116,7 @@ def check_release(out):
 
 
 def evaluate(inputs, out):
-    evaluate_checkpoint(inputs / "run/checkpoints/best.ckpt", out=out / "results")
+    evaluate_checkpoint(Checkpoint.read(inputs / "run/checkpoints/best.ckpt"), out=out / "results")
 
 
 def check_evaluation(out):

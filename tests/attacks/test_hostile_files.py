@@ -25,7 +25,7 @@ from mambaloc.errors import InputError
 from mambaloc.images import decode_image
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import read_capture
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models.weights import read_checkpoint
 from mambaloc.rendering import read_pose_table, shots_of_sequences, write_cambridge
 from mambaloc.rendering.trajectories import smooth_trajectory
 from mambaloc.runtime import Contract, Localiser

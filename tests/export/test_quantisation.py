@@ -10,7 +10,7 @@ import torch
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.export import contract_of, export_onnx, quantisation, write_bundle
 from mambaloc.export.quantisation import eight_bit, median_errors, sensitive_nodes
 from mambaloc.metrics import summarise

@@ -103,6 +103,18 @@ def test_evaluation_has_no_dropout_and_no_memory(name, gis):
 
 @EVERY
 @torch.no_grad()
+def test_forward_is_its_parts_one_after_another(name, gis):
+    network, image = small(name, gis).eval().network, frames().image
+    expected = flat(network(image))
+    branches = network.forward_features(image)
+    assert [feature.shape for feature in branches] == [(3, branches[0].shape[-1])] * 2
+    assert torch.equal(flat(network.forward_head(branches)), expected)
+    again = network.features(network.forward_backbone(image))
+    assert all(torch.equal(*pair) for pair in zip(again, branches, strict=True))
+
+
+@EVERY
+@torch.no_grad()
 def test_a_seed_determines_the_system(name, gis):
     first, again, other = (small(name, gis, seed=seed).eval() for seed in (3, 3, 4))
     assert all(torch.equal(v, again.state_dict()[k]) for k, v in first.state_dict().items())

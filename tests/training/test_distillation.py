@@ -10,8 +10,8 @@ from mambaloc.cli import main
 from mambaloc.data import PoseDataModule
 from mambaloc.distillation import LitDistillation, Teacher
 from mambaloc.errors import InputError
-from mambaloc.models.base import read_checkpoint
 from mambaloc.models.student import LitStudent
+from mambaloc.models.weights import read_checkpoint
 from mambaloc.types import PoseBatch
 
 SMALL = {"backbone": "resnet10t", "width": 16, "image_size": 32}
@@ -140,9 +140,7 @@ def test_kept_answers_are_those_of_the_centre_crops(teacher, scenes, tmp_path, m
     trainer = fit(system, scenes, tmp_path, epochs=3)
     frames = trainer.datamodule.frames("train")
     assert sum(asked[1:]) == len(system.answers.position_m) == len(frames)  # the first asks for its width
-    expected = torch.cat(
-        [answer(system.teacher, image).feature for image in trainer.datamodule.centred_images("train")]
-    )
+    expected = torch.cat([answer(system.teacher, batch.image).feature for batch in trainer.datamodule.batches("train")])
     assert torch.equal(system.answers.feature, expected)
     assert torch.equal(system.answers.of(torch.tensor([3, 1])).feature, expected[[3, 1]])
 

@@ -11,7 +11,7 @@ from mambaloc.cli import main
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.models import create_model
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models.weights import read_checkpoint
 
 SMALL = {
     "backbone": "resnet10t", "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "head_hidden": 16,

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mambaloc.cli import main
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models.weights import read_checkpoint
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -6,7 +6,7 @@ import pytest
 
 import mambaloc
 from mambaloc.data import PoseDataModule
-from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.metrics import summarise
 from mambaloc.zoo import Manifest, list_released
 
