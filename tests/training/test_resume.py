@@ -65,7 +65,7 @@ def test_stopped_run_leaves_a_checkpoint_that_resumes_exactly(how, tiny_recipe, 
     heed = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731  a shell's background jobs ignore it
     process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, preexec_fn=heed)
     last = stopped / "checkpoints/last.ckpt"
-    deadline = time.monotonic() + 300
+    deadline = time.monotonic() + 120
     while not last.exists() and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(how)
