@@ -22,6 +22,8 @@ from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Localiser, Preprocessing
 from mambaloc.runtime.bundle import rotation_deg, verify_bundle
 
+pytestmark = pytest.mark.usefixtures("converted_once")
+
 
 @pytest.fixture(scope="module")
 def student():
