@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.datamodule import Part
+from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, position_error_m, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
@@ -163,7 +163,7 @@ def _check_held_out(system: LitPoseRegressor, data: PoseDataModule) -> None:
 
 @torch.inference_mode()
 def errors_by_distance(
-    network: PoseNetwork, head: UncertaintyHead, data: PoseDataModule, part: Part
+    network: PoseNetwork, head: UncertaintyHead, data: PoseDataModule, part: Split
 ) -> ErrorsByDistance:
     """Localise the centre crops of a part's frames.
 

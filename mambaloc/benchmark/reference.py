@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 from torchvision import transforms
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.datamodule import Part
+from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
 from mambaloc.models import LitPoseRegressor
 from mambaloc.models.transposenet import LitTransPoseNet
@@ -41,7 +41,7 @@ class DecodedFrames(Dataset[tuple[Tensor, Tensor, Tensor]]):
         an item is an image, (3, H, W), normalised, a position and a quaternion.
     """
 
-    def __init__(self, data: PoseDataModule, mean: list[float], std: list[float], part: Part = "train") -> None:
+    def __init__(self, data: PoseDataModule, mean: list[float], std: list[float], part: Split = "train") -> None:
         frames = data.frames(part)
         self.paths: list[Path] = list(frames.image_paths)
         self.position_m = torch.from_numpy(frames.position_m).float()
@@ -181,7 +181,7 @@ class ReferenceLoop:
         batch_size = data.hparams["batch_size"]
         self.batches = self.loader("train", batch_size, steps * batch_size)
 
-    def loader(self, part: Part, batch_size: int, images: int) -> DataLoader[Any]:
+    def loader(self, part: Split, batch_size: int, images: int) -> DataLoader[Any]:
         """So many images of a part in batches, decoded by the loader's processes; those to train on at random."""
         frames = DecodedFrames(self.data, self.mean, self.std, part)
         chosen = RandomSampler(frames, num_samples=images) if part == "train" else range(images)

@@ -22,7 +22,8 @@ def canonical(quaternion: ArrayLike) -> Floats:
         (..., 4), of any length but 0 -> (..., 4).
     """
     q = np.asarray(quaternion, np.float64)
-    unit = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    scaled = q / np.abs(q).max(axis=-1, keepdims=True)  # squares stay in range, and digits those of mambaloc.geometry
+    unit = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
     is_flipped = np.sign(unit) @ (8.0, 4.0, 2.0, 1.0) < 0  # each weight outvotes all that follow it
     return np.where(is_flipped[..., None], -unit, unit)
 

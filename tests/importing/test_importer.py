@@ -31,10 +31,13 @@ TOOL = Path(__file__).parents[2] / "tools" / "import_scene.py"
 
 
 @pytest.fixture(scope="session")
-def scene(rendered_once, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("imported") / "room"
-    import_scene(rendered_once.folder, folder, command="python tools/import_scene.py room")
-    return folder
+def scene(rendered_once, made_once):
+    """The capture as a scene; read only."""
+
+    def make(folder):
+        import_scene(rendered_once.folder, folder / "room", command="python tools/import_scene.py room")
+
+    return made_once("imported", make) / "room"
 
 
 def told(folder):
