@@ -42,11 +42,11 @@ def small(name: str, gis: str, seed: int = 0, **kwargs) -> LitPoseRegressor:
     )
 
 
-def frames(count: int = 3, seed: int = 0) -> PoseBatch:
+def frames(count: int = 3, seed: int = 0, side: int = SIDE) -> PoseBatch:
     """Smooth images that differ visibly, with poses and points in view."""
     coarse = torch.rand(count, 3, 4, 4, generator=torch.Generator().manual_seed(seed))
-    smooth = interpolate(coarse, size=(SIDE, SIDE), mode="bilinear")
-    return replace(random_frames(count, SIDE, seed=seed), image=smooth)  # noise in every pixel looks all the same
+    smooth = interpolate(coarse, size=(side, side), mode="bilinear")
+    return replace(random_frames(count, side, seed=seed), image=smooth)  # noise in every pixel looks all the same
 
 
 def flat(prediction: PosePrediction) -> Tensor:

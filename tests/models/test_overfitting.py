@@ -13,13 +13,15 @@ from mambaloc.models import LitPoseRegressor
 FAR_APART = ["mambaloc", "lstm_posenet", "transbonet"]
 
 
-def learned_by_heart(name: str, steps: int, lr: float, start: nn.Module | None = None, **kwargs) -> LitPoseRegressor:
+def learned_by_heart(
+    name: str, side: int, steps: int, lr: float, start: nn.Module | None = None, **kwargs
+) -> LitPoseRegressor:
     """Train on eight frames without dropout at a falling rate: the median errors end under 5 cm and 3 degrees.
 
     The errors are those of the last step: batch norm's running statistics of so few pixels are others than a batch's.
     """
-    system = small(name, "gis", lr=lr, dropout=0.0, weight_decay=0.0, **kwargs)
-    batch = frames(8)
+    system = small(name, "gis", lr=lr, dropout=0.0, weight_decay=0.0, image_size=side, **kwargs)
+    batch = frames(8, side=side)
     if start is not None:
         system.network.load_state_dict(start.state_dict())
     optimizer = system.configure_optimizers()["optimizer"]
@@ -40,14 +42,14 @@ def learned_by_heart(name: str, steps: int, lr: float, start: nn.Module | None =
 
 @pytest.mark.parametrize("name", FAR_APART)
 def test_systems_far_apart_learn_eight_frames_by_heart(name):
-    learned_by_heart(name, steps=80, lr=1e-2)
+    learned_by_heart(name, side=32, steps=80, lr=1e-2)
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", mambaloc.list_models())
 def test_every_system_learns_eight_frames_by_heart(name):
     """300 steps of a larger backbone take 6 to 20 s each."""
-    larger = {"steps": 300, "backbone": "mobilenetv3_small_050"}
+    larger = {"side": 64, "steps": 300, "backbone": "mobilenetv3_small_050"}
     # From afar the reprojection error is clipped and flat: it starts from learned weights, as its recipe does.
     start = learned_by_heart("posenet_learned", lr=3e-3, **larger).network if name == "posenet_geometric" else None
     learned_by_heart(name, lr=1e-4 if start else 3e-3, start=start, **larger)
