@@ -15,9 +15,6 @@ Unit = Literal["metre", "unknown"]
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes of OpenGL, ARKit and ARCore (x right, y up, z backwards) in OpenCV's, and the other way."""
 
-ROTATION_TOLERANCE = 1e-2
-"""How far entries of ``R R^T`` may be from the identity's, where a file's decimals have rounded a rotation ``R``."""
-
 
 @dataclass(frozen=True)
 class Camera:

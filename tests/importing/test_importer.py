@@ -179,6 +179,18 @@ def test_bad_frames_are_left_out_and_named(rendered, tmp_path):
     assert "0008.png | image is truncated" in (tmp_path / "a/report.md").read_text()
 
 
+def test_a_frame_too_far_to_be_read_back_is_left_out(rendered, tmp_path):
+    def move(said):
+        said["frames"][3]["transform_matrix"][1][3] = -1.1e7
+
+    rendered.edit(move)
+    imported = import_scene(rendered.folder, tmp_path / "a")
+    assert {Path(file).name: rule for file, rule in imported.left_out.items()} == {
+        "0004.png": "position is farther than 1e+07 from the origin"
+    }
+    assert len(read_rows(tmp_path / "a")) == 39
+
+
 def test_images_of_another_shape_are_not_used(rendered, tmp_path):
     rendered.edit(
         lambda said: [said.pop(key) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")]

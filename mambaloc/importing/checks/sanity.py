@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.importing.capture import ROTATION_TOLERANCE, Capture
+from mambaloc.data.frames import FARTHEST, ROTATION_TOLERANCE
+from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.findings import Finding
 from mambaloc.importing.motion import Motion, quaternions
 from mambaloc.runtime.rotations import is_rotation
@@ -33,6 +34,12 @@ def bad_poses(world_from_cam: NDArray[np.float64]) -> dict[int, str]:
         pose = world_from_cam[row]
         found[row] = _broken(pose) if np.isfinite(pose).all() else "pose has NaN or infinite numbers"
     return found
+
+
+def far_poses(world_from_cam: NDArray[np.float64]) -> dict[int, str]:
+    """The rule that frames too far from the origin to be read back break, by row; poses as :func:`bad_poses`."""
+    is_far = (np.abs(world_from_cam[:, :3, 3]) > FARTHEST).any(axis=1)
+    return dict.fromkeys(np.flatnonzero(is_far).tolist(), f"position is farther than {FARTHEST:g} from the origin")
 
 
 def _broken(pose: NDArray[np.float64]) -> str:

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.data.datasets.capture import MOST_FRAMES
+from mambaloc.data.frames import ROTATION_TOLERANCE, UNIT_TOLERANCE
 from mambaloc.errors import InputError
 from mambaloc.images import LARGEST_SIDE_PX
-from mambaloc.importing.capture import ROTATION_TOLERANCE, Camera, Capture, Unit
+from mambaloc.importing.capture import Camera, Capture, Unit
 from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quaternion_from_matrix
 
 Matrices = NDArray[np.float64]
 
 _FARTHEST = 1e9  # in a file's own unit and world: the importer shifts worlds that are far from their origin
-_UNIT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[
         norm = np.linalg.norm(quaternion, axis=1)
     _refuse(~((norm > 0.5) & (norm < 2)), where, "the quaternion is far from unit length")
     world_from_cam = _transforms(matrix_from_quaternion(quaternion), position, where)
-    return world_from_cam, int((np.abs(norm - 1) > _UNIT_TOLERANCE).sum())
+    return world_from_cam, int((np.abs(norm - 1) > UNIT_TOLERANCE).sum())
 
 
 def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[float], where: str | Path) -> Camera:
