@@ -16,7 +16,7 @@ from mambaloc.export.quantisation import eight_bit, median_errors, sensitive_nod
 from mambaloc.metrics import summarise
 from mambaloc.models.student import LitStudent
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("converted_once")]
 
 
 @pytest.fixture(scope="module")
