@@ -23,9 +23,10 @@ from torch import Tensor, nn
 from mambaloc.data import PoseDataModule
 from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
-from mambaloc.metrics import PoseErrors
+from mambaloc.metrics import error_table
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork
+from mambaloc.types import PosePrediction
 
 LEVEL = 0.9
 """Share of poses whose errors are to be within the radii."""
@@ -174,12 +175,14 @@ def errors_by_distance(
         data: set up for the part.
         part: ``val`` or ``test``.
     """
-    errors, distances = PoseErrors(), []
-    for batch in data.batches(part):
-        feats = network.forward_backbone(batch.image)
-        errors.update(network.forward_head(network.features(feats)), batch)
+    distances: list[Tensor] = []
+
+    def localise(image: Tensor) -> PosePrediction:
+        feats = network.forward_backbone(image)
         distances.append(head.distance(pooled(feats)))
-    table = errors.table()
+        return network.forward_head(network.features(feats))
+
+    table = error_table(localise, data.batches(part))
     return ErrorsByDistance(torch.cat(distances), table.position_error_m, table.rotation_error_deg)
 
 

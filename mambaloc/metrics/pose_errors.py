@@ -103,6 +103,8 @@ class PoseErrors(Metric):
 def error_table(localise: Callable[[Tensor], PosePrediction], batches: Iterable[PoseBatch]) -> PoseErrorTable:
     """Localise frames, and return every frame's prediction and errors.
 
+    Only this process's frames count: one process of a distributed training may call it alone.
+
     Args:
         localise: images, (B, 3, H, W) in 0..1, to poses.
         batches: of a split, cropped.
@@ -110,7 +112,7 @@ def error_table(localise: Callable[[Tensor], PosePrediction], batches: Iterable[
     errors = PoseErrors()
     for batch in batches:
         errors.update(localise(batch.image), batch)
-    return errors.table()
+    return errors._table()  # table() would wait for the other processes
 
 
 def summarise(table: PoseErrorTable) -> dict[str, float]:

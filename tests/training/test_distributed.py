@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from mambaloc.cli import main
+from mambaloc.runtime import Localiser
 
 TRAIN = (sys.executable, Path(__file__).parents[2] / "tools/train.py")
 MEDIANS = ("val/position_error_m", "val/rotation_error_deg")
@@ -47,11 +48,15 @@ def assert_one_training(run, recipe, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_of_lightnings(recipe, tmp_path):
+    """They keep the best epoch, too, and the first of them exports it with its uncertainty while the other waits."""
     run = tmp_path / "runs/run"
     words = [*TRAIN, recipe, "--trainer.devices", "2", "--trainer.default_root_dir", run]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    words += ["--best_checkpoint.save_top_k", "1", "--onnx_export.enabled", "true"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 0, done.stderr
     assert_one_training(run, recipe, tmp_path)
+    assert json.loads((run / "evaluation/best/metrics.json").read_text())["selection"].startswith("best: lowest")
+    assert Localiser(run / "model.onnx").contract.uncertainty is not None
 
 
 @pytest.mark.slow
