@@ -89,8 +89,12 @@ class Checkpoint:
 
     @property
     def backbone_arguments(self) -> dict[str, Any]:
-        """Arguments of the backbone that the training started from, as ``mambaloc.nn``'s backbones take them."""
-        return {theirs: self.stored["hyper_parameters"][ours] for theirs, ours in BACKBONE_ARGUMENTS.items()}
+        """Arguments of the backbone that the training started from, as ``mambaloc.nn``'s backbones take them.
+
+        None for those that the system does not have.
+        """
+        stored = self.stored["hyper_parameters"]
+        return {theirs: stored.get(ours) for theirs, ours in BACKBONE_ARGUMENTS.items()}
 
     @cached_property
     def sha256(self) -> str:

@@ -8,6 +8,7 @@ import torch
 import yaml
 
 from mambaloc.errors import InputError
+from mambaloc.evaluation.evaluate import _first_backbone
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.models.mambaloc import LitMambaLoc
 from mambaloc.models.weights import build_from
@@ -74,6 +75,14 @@ def test_the_backbone_that_a_training_started_from(best):
         "name": "test_efficientnet", "weights": "timm", "timm_args": None, "pixel_mean": [0.5, 0.5, 0.5],
         "pixel_std": None,
     }  # fmt: skip
+
+
+def test_a_system_without_arguments_of_a_backbone(best):
+    """Evaluating it with --retrieval ends in one line, as for a backbone that started from scratch."""
+    fixed = replace(best, stored={**best.stored, "hyper_parameters": {"lr": 0.001}})
+    assert set(fixed.backbone_arguments.values()) == {None}
+    with pytest.raises(InputError, match="--retrieval: this backbone started from scratch"):
+        _first_backbone(fixed)
 
 
 def test_what_only_a_resumed_training_needs_is_not_kept(best):

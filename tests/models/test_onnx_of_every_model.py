@@ -34,6 +34,7 @@ def test_onnx_runtime_agrees(name, tmp_path, monkeypatch):
     assert_onnx_runtime_agrees(name, tmp_path / "model.onnx")
 
 
+@pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["lstm_posenet", *SAME_GRAPH])
 def test_onnx_runtime_agrees_at_full_length_and_for_each_name(name, tmp_path):

@@ -45,6 +45,7 @@ def test_systems_far_apart_learn_eight_frames_by_heart(name):
     learned_by_heart(name, side=32, steps=80, lr=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", mambaloc.list_models())
 def test_every_system_learns_eight_frames_by_heart(name):

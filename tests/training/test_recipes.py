@@ -58,9 +58,14 @@ def teacher(made_once):
 
 @pytest.fixture
 def tiny_backbones(monkeypatch):
-    """A tiny network whatever timm is asked for."""
+    """A tiny network whichever of its own timm is asked for."""
     create = timm.create_model
-    monkeypatch.setattr(timm, "create_model", lambda name, **kwargs: create("test_efficientnet", **kwargs))
+
+    def create_tiny(name, **kwargs):
+        assert timm.is_model(name)
+        return create("test_efficientnet", **kwargs)
+
+    monkeypatch.setattr(timm, "create_model", create_tiny)
 
 
 def stand_in(recipe: Path, scenes: Path, cambridge: Path, teacher: Path) -> list[str]:
