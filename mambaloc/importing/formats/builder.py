@@ -85,7 +85,7 @@ def build_capture(
         cameras=dict(cameras or {}),
         camera_of=tuple(cameras_of) if len(cameras_of) == len(ordered) else None,
         time_s=np.array(times) if len(times) == len(ordered) else None,
-        split=tuple(splits) if len(splits) == len(ordered) else None,
+        split=tuple(splits) if len(splits) == len(ordered) and set(splits) != {"unused"} else None,
         poses_without_image=tuple(missing),
         images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in used),
     )

@@ -178,6 +178,12 @@ def test_splits_by_name(write, tmp_path):
     assert read_capture(tmp_path).split == ("train", "unused", "test")
 
 
+def test_a_split_of_images_that_are_not_there_is_none(write, tmp_path):
+    names = ("images/a_1.png", "images/a_2.png")
+    write(names, absent=names[:1], train_filenames=names[:1])
+    assert read_capture(tmp_path).split is None
+
+
 def test_a_pose_that_is_not_known_stays_for_the_checks(write, tmp_path):
     write(frame={"transform_matrix": [[math.nan] * 4] * 4})
     assert np.isnan(read_capture(tmp_path).world_from_cam[:, :3]).all()
