@@ -19,6 +19,12 @@ Image = NDArray[np.uint8]
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 """Suffixes of files that are taken for images."""
 
+LARGEST_SIDE_PX = 32_766
+"""Longest side of an image, and of cameras: ``cv2.remap``, which removes distortion, takes no longer one."""
+
+CORNER_PX = 0.5
+"""Column and row of the top-left pixel's centre where others count from its corner; here the centre is (0, 0)."""
+
 END_BYTES = 4096
 """How far from a file's end its format's last marker may lie."""
 

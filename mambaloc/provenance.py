@@ -48,6 +48,11 @@ def device_name(cuda_index: int | None = None) -> str:
     return f"{_processor()}, {torch.get_num_threads()} threads"
 
 
+def machine(cuda_index: int | None = None) -> str:
+    """Name the processor, or a CUDA device, and the commit: what a printed measurement ends with."""
+    return f"{device_name(cuda_index)}, commit {commit()}"
+
+
 def _processor() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()

@@ -3,8 +3,8 @@
 An image is compared with training images in what the backbone sees of it as a whole. The farther the nearest one, the
 larger the error: how much larger is measured on frames held out of training, by split conformal prediction (Lei et al.
 2018, "Distribution-free predictive inference for regression", section 5.2). That promises its share of frames that come
-as the held-out ones did; another walk through the place is another draw. ``benchmark.py uncertainty`` measures this
-beside dropout, shifted crops and ensembles.
+as the held-out ones did; another walk through the place is another draw. ``tools/benchmarks/uncertainty.py`` measures
+this beside dropout, shifted crops and ensembles.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.datamodule import Part
+from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, position_error_m, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
@@ -163,7 +163,7 @@ def _check_held_out(system: LitPoseRegressor, data: PoseDataModule) -> None:
 
 @torch.inference_mode()
 def errors_by_distance(
-    network: PoseNetwork, head: UncertaintyHead, data: PoseDataModule, part: Part
+    network: PoseNetwork, head: UncertaintyHead, data: PoseDataModule, part: Split
 ) -> ErrorsByDistance:
     """Localise the centre crops of a part's frames.
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.demo import build_site, embedded_film, serve_page
-from mambaloc.zoo.bundles import released_bundle
 
 
 @exits_cleanly
@@ -19,12 +18,18 @@ def main() -> None:
     parser.add_argument("--film", type=Path, help="video for the page to play")
     parser.add_argument("--out", type=Path, help="write the page there, for any web server, and end")
     args = parser.parse_args()
-    bundle = args.bundle or released_bundle()
+    bundle = args.bundle or _released_bundle()
     film = args.film or (None if args.bundle else embedded_film())
     if args.out:
         print(f"wrote {build_site(bundle, args.out, film)}")
     else:
         serve_page(bundle, film, args.port, args.lan)
+
+
+def _released_bundle() -> Path:
+    from mambaloc.zoo.bundles import released_bundle  # needs torch, which a bundle that is there does not
+
+    return released_bundle()
 
 
 if __name__ == "__main__":

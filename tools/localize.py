@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mambaloc.console import exits_cleanly, thread_count
 from mambaloc.runtime import Localiser
-from mambaloc.runtime.report import FILTERS, follow
+from mambaloc.runtime.video import FILTERS, follow
 
 
 @exits_cleanly
@@ -15,7 +15,7 @@ def main() -> None:
     parser.add_argument(
         "model", nargs="?", help="exported model, bundle or ARCH.TAG; unless given, the embedded room's"
     )
-    parser.add_argument("source", help="a video, a picture, a folder of pictures, or a camera's number")
+    parser.add_argument("source", help="a video, a picture, a folder of pictures (30 a second), or a camera's number")
     parser.add_argument("--out", type=Path, default=Path("poses.tum"), help="trajectory to write, TUM format")
     parser.add_argument("--filter", choices=FILTERS, help="steady a video's poses: from those before, or from all")
     parser.add_argument("--threads", type=thread_count, help="that one image may use")

@@ -98,17 +98,15 @@ def forward(system: LitPoseRegressor, frames: PoseBatch) -> Callable[[], object]
     return call
 
 
-def training_step(system: LitPoseRegressor, frames: PoseBatch, half: bool = False) -> Callable[[], object]:
-    """Forward, loss, backward and optimiser step, the first two in bfloat16 where it serves if ``half``."""
+def training_step(system: LitPoseRegressor, frames: PoseBatch) -> Callable[[], object]:
+    """Forward, loss, backward and optimiser step."""
     optimizer = system.configure_optimizers()["optimizer"]
 
     def call() -> None:
         system.train()
         system.loss.train(frames.clip_length > 1)  # a single image has no relative pose, which only training refuses
         optimizer.zero_grad()
-        with torch.autocast(frames.image.device.type, torch.bfloat16, enabled=half):
-            loss = system.loss(system(frames.image), frames)
-        loss.backward()
+        system.loss(system(frames.image), frames).backward()
         optimizer.step()
 
     return call

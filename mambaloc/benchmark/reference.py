@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 from torchvision import transforms
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.datamodule import Part
+from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
 from mambaloc.models import LitPoseRegressor
 from mambaloc.models.transposenet import LitTransPoseNet
@@ -41,7 +41,7 @@ class DecodedFrames(Dataset[tuple[Tensor, Tensor, Tensor]]):
         an item is an image, (3, H, W), normalised, a position and a quaternion.
     """
 
-    def __init__(self, data: PoseDataModule, mean: list[float], std: list[float], part: Part = "train") -> None:
+    def __init__(self, data: PoseDataModule, mean: list[float], std: list[float], part: Split = "train") -> None:
         frames = data.frames(part)
         self.paths: list[Path] = list(frames.image_paths)
         self.position_m = torch.from_numpy(frames.position_m).float()
@@ -70,68 +70,53 @@ class DecodedFrames(Dataset[tuple[Tensor, Tensor, Tensor]]):
 class Published(nn.Module):
     """A network of ours in its published form: the same function of the same weights, with more work.
 
+    timm's ``features_only`` backbone runs its stages past the last feature map that is read. Encoders drop a tenth of
+    the attention weights, as ``nn.MultiheadAttention`` does, which keeps them from fused attention, and compute their
+    last layer for all tokens, of which one is read. GIS runs as a sequence of two through the general scan. Images and
+    weights are channels first, and PyTorch draws the masks of dropout.
+
     Args:
         system: MambaLoc or TransPoseNet, whose network's weights are copied.
-        dead_stages: run the backbone's stages past the last feature map that is read, as timm's ``features_only`` does.
-        attention_dropout: drop a tenth of the attention weights, as ``nn.MultiheadAttention`` does; without, fused
-            attention runs.
-        every_token: compute the last encoder layer for all tokens, of which one is read.
-        scan: run GIS as a sequence of two through the general scan.
-        torch_dropout: let PyTorch draw the other dropout's masks.
-        contiguous: keep images and weights as PyTorch lays them out, channels first.
 
     Shape:
         images (B, 3, H, W), normalised -> :class:`~mambaloc.types.PosePrediction`.
     """
 
-    def __init__(
-        self,
-        system: LitTransPoseNet,
-        dead_stages: bool = True,
-        attention_dropout: bool = True,
-        every_token: bool = True,
-        scan: bool = True,
-        torch_dropout: bool = True,
-        contiguous: bool = True,
-    ) -> None:
+    def __init__(self, system: LitTransPoseNet) -> None:
         super().__init__()
         network: Any = deepcopy(system.network)
-        self.backbone = _whole_backbone(system) if dead_stages else network.backbone.body
-        self.maps = (2, 3) if dead_stages else (0, 1)  # strides 8 and 16
+        self.backbone = _whole_backbone(system)
         self.encoders = nn.ModuleList((network.position_encoder, network.orientation_encoder))
         self.gis = nn.ModuleList((network.position_gis, network.orientation_gis))
-        self.head, self.every_token, self.scan = network.head, every_token, scan
-        self.layout = torch.contiguous_format if contiguous else torch.channels_last
-        self.backbone.to(memory_format=self.layout)
+        self.head = network.head
         layers: list[Any] = [module for module in self.modules() if isinstance(module, EncoderLayer)]
         for layer in layers:
-            layer.attention_dropout = 0.1 if attention_dropout else 0.0
-            if torch_dropout:
-                layer.mlp[2], layer.dropout = (nn.Dropout(ours.p) for ours in (layer.mlp[2], layer.dropout))
+            layer.attention_dropout = 0.1
+            layer.mlp[2], layer.dropout = (nn.Dropout(ours.p) for ours in (layer.mlp[2], layer.dropout))
 
     def forward(self, image: Tensor) -> PosePrediction:
         """Localise images."""
-        maps = self.backbone(image.contiguous(memory_format=self.layout))
-        stride8_BCHW, stride16_BCHW = (maps[index] for index in self.maps)
+        maps = self.backbone(image.contiguous(memory_format=torch.contiguous_format))
+        stride8_BCHW, stride16_BCHW = maps[2:4]
         position_BD, orientation_BD = (
-            self._select(gis, self._encode(encoder, feats))
+            _select(gis, _encode(encoder, feats))
             for gis, encoder, feats in zip(self.gis, self.encoders, (stride16_BCHW, stride8_BCHW), strict=True)
         )
         return self.head(position_BD, orientation_BD)
 
-    def _encode(self, encoder: Any, feats_BCHW: Tensor) -> Tensor:
-        if not self.every_token:
-            return encoder(feats_BCHW)
-        cells_BND = encoder.project(feats_BCHW).flatten(2).mT
-        tokens_BND = torch.cat((encoder.token.expand(len(cells_BND), -1, -1), cells_BND), dim=1)
-        for layer in encoder.layers:
-            tokens_BND = layer(tokens_BND, encoder.positions())
-        return encoder.norm(tokens_BND)[:, 0]
 
-    def _select(self, gis: nn.Module, feats_BD: Tensor) -> Tensor:
-        if not self.scan or not isinstance(gis, GlobalInformationSelector):
-            return gis(feats_BD)
-        return gis.mixer(torch.stack((feats_BD.flip(-1), feats_BD), dim=1))[:, 1]
+def _encode(encoder: Any, feats_BCHW: Tensor) -> Tensor:
+    cells_BND = encoder.project(feats_BCHW).flatten(2).mT
+    tokens_BND = torch.cat((encoder.token.expand(len(cells_BND), -1, -1), cells_BND), dim=1)
+    for layer in encoder.layers:
+        tokens_BND = layer(tokens_BND, encoder.positions())
+    return encoder.norm(tokens_BND)[:, 0]
+
+
+def _select(gis: Any, feats_BD: Tensor) -> Tensor:
+    if not isinstance(gis, GlobalInformationSelector):
+        return gis(feats_BD)
+    return gis.mixer(torch.stack((feats_BD.flip(-1), feats_BD), dim=1))[:, 1]
 
 
 def _whole_backbone(system: LitTransPoseNet) -> nn.Module:
@@ -181,7 +166,7 @@ class ReferenceLoop:
         batch_size = data.hparams["batch_size"]
         self.batches = self.loader("train", batch_size, steps * batch_size)
 
-    def loader(self, part: Part, batch_size: int, images: int) -> DataLoader[Any]:
+    def loader(self, part: Split, batch_size: int, images: int) -> DataLoader[Any]:
         """So many images of a part in batches, decoded by the loader's processes; those to train on at random."""
         frames = DecodedFrames(self.data, self.mean, self.std, part)
         chosen = RandomSampler(frames, num_samples=images) if part == "train" else range(images)

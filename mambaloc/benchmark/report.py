@@ -13,8 +13,6 @@ from rich.table import Table
 from mambaloc import provenance
 from mambaloc.benchmark.deployment import Deployment, speed_up
 from mambaloc.benchmark.latency import Latency, forward_flops
-from mambaloc.benchmark.loading import LoadingRates
-from mambaloc.benchmark.scenes import SceneCost
 from mambaloc.benchmark.sizes import UNEXPLAINED, Size
 from mambaloc.export.quantisation import LARGEST_LOSS
 from mambaloc.models.base import mib
@@ -94,42 +92,10 @@ def _run(source: str) -> str:
     return path.parent.parent.name if path.suffix == ".ckpt" else source
 
 
-def print_loading(rates: LoadingRates, machine: str) -> None:
-    """Print images per second, and their ratio."""
-    for name, figures in (("decode-once cache", rates.cached), ("decode every epoch", rates.decoded)):
-        print(f"{name:20}{median(figures):8.0f} images/s on one core  ({min(figures):.0f} to {max(figures):.0f})")
-    print(f"ratio {rates.ratio:.1f}   {machine}")
-
-
-def print_scenes(scenes: Sequence[SceneCost], machine: str) -> None:
-    """Print a row a scene: frames, seconds, memory, disk; then which are the benchmark's, and which are rendered."""
-    names = ("scene", "frames", "read s", "decode s", "open s", "memory MiB", "disk MiB")
-    table = new_table("Scenes loaded whole: train + test frames, images + cache on disk", *names)
-    for each in scenes:
-        train, test = each.counts
-        seconds = (f"{s:.1f}" for s in (each.read_s, each.build_s, each.open_s))
-        memory = f"{(each.peak_bytes - each.start_bytes) / 2**20:.0f}"
-        disk = f"{each.image_bytes / 2**20:.0f} + {each.cache_bytes / 2**20:.0f}"
-        table.add_row(each.scene, f"{train} + {test}", *seconds, memory, disk)
-    console = Console(highlight=False)
-    console.print(table)
-    for said, which in {
-        "of the benchmark's size": [each.scene for each in scenes if each.counts == each.official],
-        "of another size than the benchmark's": [each.scene for each in scenes if each.counts != each.official],
-        "rendered, no real pictures": [each.scene for each in scenes if each.rendered],
-        "with bad frames": [f"{each.scene} ({each.skipped})" for each in scenes if each.skipped],
-    }.items():
-        if which:
-            console.print(f"{said}: {', '.join(which)}", soft_wrap=True)
-    console.print("decode: once, ever; open: from the cache, each run. Memory: the most while loading, the")
-    console.print("cache's mapped pages included, less that of the process before it.")
-    console.print(machine, soft_wrap=True)
-
-
 def new_table(title: str, *columns: str) -> Table:
     """Begin a table; columns of words to the left, of numbers to the right."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for column in columns:
-        text = column in ("system", "gis", "what", "form", "scene", "part", "left out", "kernel", "way")
+        text = column in ("system", "gis", "what", "form", "scene", "part", "way")
         table.add_column(column, justify="left" if text else "right", no_wrap=True)
     return table

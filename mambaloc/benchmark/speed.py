@@ -73,18 +73,6 @@ class Setting:
         """Where it is trained."""
         return _trainer(self).strategy.root_device
 
-    @property
-    def is_half(self) -> bool:
-        """Whether forward passes run in bfloat16.
-
-        Raises:
-            InputError: for a precision that is not measured here.
-        """
-        precision = self.trainer.get("precision", "32-true")
-        if precision not in ("32-true", "bf16-mixed"):
-            raise InputError(f"trainer.precision {precision}: speed is measured in 32-true or bf16-mixed")
-        return precision == "bf16-mixed"
-
     def fit(self, system: LitPoseRegressor, data: PoseDataModule, callback: L.Callback, **options: Any) -> L.Trainer:
         """Train with nothing beside the callback, and without validation unless told."""
         options = {"num_sanity_val_steps": 0, "limit_val_batches": 0, "max_steps": -1, **options}

@@ -12,11 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from mambaloc import provenance
-from mambaloc.benchmark.floors import Floors, measure_floors
 from mambaloc.benchmark.footprint import Footprint, exponent, measure_footprints, measure_scaling
-from mambaloc.benchmark.loading import LoadingRates, measure_loading
 from mambaloc.benchmark.report import new_table
-from mambaloc.benchmark.savings import SAVINGS, Savings, measure_savings
 from mambaloc.benchmark.speed import (
     LOOP_ALONE,
     OURS,
@@ -31,8 +28,6 @@ from mambaloc.benchmark.speed import (
 from mambaloc.benchmark.whole_training import WholeTraining, check_whole_training, measure_whole_training
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
-from mambaloc.models.registry import model_class
-from mambaloc.models.transposenet import LitTransPoseNet
 
 
 @dataclass(frozen=True)
@@ -42,9 +37,6 @@ class SpeedReport:
     Args:
         setting: what was trained on what.
         speed: images a second, parts of a step.
-        loading: from the cache, and decoding.
-        savings: of the network; None for a system without a published form here.
-        floors: of a step.
         footprints: memory and seconds to the first step.
         scaling: the same for whole epochs, by frames.
         whole: a training to its end, if an error was sought.
@@ -52,9 +44,6 @@ class SpeedReport:
 
     setting: Setting
     speed: Speed
-    loading: LoadingRates
-    savings: Savings | None
-    floors: Floors
     footprints: list[Footprint]
     scaling: list[Footprint]
     whole: WholeTraining | None = None
@@ -83,18 +72,13 @@ def measure_all(
     Raises:
         InputError: for too few repetitions to tell a spread, or a scene with too few frames.
     """
-    batch = setting.data.get("batch_size", 8)
     _check(setting, frames, sought_m)
     check_speed(setting.build()[1], batches, steps, repetitions)
     footprints = measure_footprints(setting, steps, workers)
     speed = measure_speed(setting, batches, steps, repetitions, workers)
-    published = issubclass(model_class(setting.system), LitTransPoseNet)
-    savings = measure_savings(setting, batch, repetitions) if published else None
-    floors = measure_floors(setting, batch, repetitions)
-    loading = measure_loading(setting.build()[1], repetitions=repetitions)
     scaling = measure_scaling(setting, frames)
     whole = None if sought_m is None else measure_whole_training(setting, sought_m)
-    return SpeedReport(setting, speed, loading, savings, floors, footprints, scaling, whole)
+    return SpeedReport(setting, speed, footprints, scaling, whole)
 
 
 def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> None:
@@ -107,7 +91,6 @@ def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> N
         raise InputError(f"--frames {frames[0]}: how cost grows takes two numbers or more")
     if sought_m is not None:
         check_whole_training(setting)
-    setting.is_half  # noqa: B018  it tells a precision that is not measured
     data = setting.build()[1]
     data.setup("fit")
     if max(frames, default=0) > len(data.frames("train")):
@@ -117,10 +100,7 @@ def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> N
 def print_report(report: SpeedReport, machine: str) -> None:
     """Print every part that was measured."""
     console = Console(highlight=False)
-    print_speed(report.speed, report.loading, console)
-    if report.savings:
-        print_savings(report.savings, console)
-    print_floors(report.floors, console)
+    print_speed(report.speed, console)
     print_footprints(report.footprints, console)
     if report.scaling:
         print_scaling(report.scaling, console)
@@ -136,10 +116,9 @@ def write_report(report: SpeedReport, path: Path, machine: str) -> None:
         partial.write_text(json.dumps(told, indent=1, default=str), encoding="utf-8")
 
 
-def print_speed(speed: Speed, loading: LoadingRates, console: Console) -> None:
-    """Print loading, training and evaluation beside the reference, then where a step's time goes."""
+def print_speed(speed: Speed, console: Console) -> None:
+    """Print training and evaluation beside the reference, then where a step's time goes."""
     table = new_table("Images a second", "what", "ratio", "± IQR", "ours", "reference")
-    _rates(table, "loading, a core", loading.cached, loading.decoded)
     _rates(table, "training", speed.training[OURS], speed.training[REFERENCE])
     if LOOP_ALONE in speed.training:
         _rates(table, "training, our network in it", speed.training[OURS], speed.training[LOOP_ALONE])
@@ -170,35 +149,6 @@ def _parts(speed: Speed) -> Table:
         table.add_row("Lightning's trainer" if part == "trainer" else part, *cells)
     table.add_row("all", *(cell for way in (OURS, REFERENCE) for cell in (f"{1000 * totals[way]:.2f}", "")))
     return table
-
-
-def print_savings(savings: Savings, console: Console) -> None:
-    """Print what a forward and backward pass takes with each saving left out, and GIS's own part of it."""
-    table = new_table("Forward and backward pass, times ours", "left out", "times ours", "± IQR")
-    for name, seconds in savings.left_out.items():
-        table.add_row(SAVINGS[name], *(f"{value:.3f}" for value in savings.times_as_long(seconds)))
-    table.add_row("all of them: as published", *(f"{v:.3f}" for v in savings.times_as_long(savings.published)))
-    console.print(table)
-    if savings.gis and savings.gis_together:
-        share, spread = savings.times_as_long(savings.gis)
-        console.print(f"both branches' GIS: {share:.2%} ± {spread:.2%} of the pass")
-        times, spread = ratio(savings.gis_together, savings.gis)
-        console.print(f"the two as one block, weights stacked: {times:.2f} ± {spread:.2f} times as long as apart")
-
-
-def print_floors(floors: Floors, console: Console) -> None:
-    """Print how far a step is from the machine's rates, and its largest kernels."""
-    rates = f"{floors.flops_per_s / 1e12:.3f} TFLOP/s, {floors.bytes_per_s / 1e9:.1f} GB/s"
-    work = f"{floors.flops / 1e9:.1f} GFLOP, {floors.bytes / 1e9:.2f} GB"
-    console.print(
-        f"a step on a batch that is there: {1000 * floors.step_s:.2f} ms; {work}; this machine: {rates}\n"
-        f"of the rate of operations it reaches {floors.of_operations:.0%}, of the bandwidth {floors.of_bytes:.0%}",
-        soft_wrap=True,
-    )
-    table = new_table("Kernels of a step, by their own time", "kernel", "share")
-    for name, share in floors.kernels:
-        table.add_row(name if len(name) < 60 else f"{name[:57]}...", f"{share:.1%}")
-    console.print(table)
 
 
 def print_footprints(footprints: Sequence[Footprint], console: Console) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -24,18 +24,13 @@ from mambaloc.data.augmentation import (
     draw_uniforms,
     turned,
 )
-from mambaloc.data.cached_dataset import CachedFrames
-from mambaloc.data.datasets.capture import describe_capture, focal_ratio_of
-from mambaloc.data.datasets.registry import CAPTURE, DATASETS, is_official, is_rendered, locate, scene_folder
-from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
-from mambaloc.data.loaded_split import LoadedSplit, describe_points, load_split
-from mambaloc.data.points import read_points
-from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
+from mambaloc.data.frame_dataset import CachedFrames
+from mambaloc.data.frames import Frames, OnBadFrame, Split
+from mambaloc.data.scene import Scene
+from mambaloc.data.splits import Validation
 from mambaloc.errors import InputError
 from mambaloc.geometry import cropped_intrinsics
-from mambaloc.types import PoseBatch, height_and_width
-
-Part = Literal["train", "val", "test"]
+from mambaloc.types import PoseBatch
 
 
 class PoseDataModule(L.LightningDataModule):
@@ -104,14 +99,10 @@ class PoseDataModule(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
+        self.scene = Scene(**{field.name: self.hparams[field.name] for field in fields(Scene)})
         # LightningCLI has given what the recipe says; what is kept, and told, is what that means.
-        dataset, root, scene = locate(dataset, root, scene)
-        self.hparams.update(dataset=dataset, root=root, scene=scene)
-        self.crop = height_and_width(image_size)
-        if max(self.crop) > short_side and min(self.crop) > short_side:
-            raise InputError(f"data.image_size {image_size}: larger than data.short_side {short_side}; enlarge that")
-        if points_per_frame < 0:
-            raise InputError(f"data.points_per_frame {points_per_frame}: must be 0 or more; 0 reads none")
+        self.hparams.update(dataset=self.scene.dataset, root=self.scene.root, scene=self.scene.scene)
+        self.crop = self.scene.crop
         is_bad = focal_ratio not in (None, "scene") and not (isinstance(focal_ratio, int | float) and focal_ratio > 0)
         if is_bad or (focal_ratio is not None and points_per_frame > 0):
             raise InputError(
@@ -119,32 +110,25 @@ class PoseDataModule(L.LightningDataModule):
                 "follow the crop; leave it out, or say 'scene'"
             )
         self.jitter = Jitter(brightness, contrast, saturation)
-        self._loaded: dict[Part, LoadedSplit] = {}
-        self._listed: dict[str, int] = {}
-        self._resident: dict[Part, CachedFrames] = {}
+        self._resident: dict[Split, CachedFrames] = {}
         self._uniforms: tuple[tuple[int, int, torch.device], Tensor] | None = None
 
     @property
     def folder(self) -> Path:
         """The scene's folder."""
-        root = self.hparams["root"]
-        return scene_folder(self.hparams["dataset"], Path(root) if root else None, self.hparams["scene"])
+        return self.scene.folder
 
     def setup(self, stage: str) -> None:
         """Read and decode what a stage needs; every process may, since the cache is built by one of them."""
-        if stage in ("fit", "validate") and "train" not in self._loaded:
-            self._load_train_and_val()
-        needs_test = stage in ("test", "predict") or self.hparams["validation"] == "test_set"
-        if needs_test and "test" not in self._loaded:
-            frames, bad = self._read("test")
-            self._loaded["test"] = self._decode(frames, bad)
-        if self.hparams["validation"] == "test_set" and stage in ("fit", "validate") and "val" not in self._loaded:
-            self._loaded["val"] = self._with_points(self._loaded["test"])
+        if stage in ("fit", "validate"):
+            self.scene.load_training()
+        if stage in ("test", "predict"):
+            self.scene.load_test()
 
     @property
     def train_position_m(self) -> Tensor:
         """Positions of the training frames, (N, 3)."""
-        return self._loaded["train"].data.position_m
+        return self.scene.parts["train"].data.position_m
 
     def listed_training_frames(self) -> Frames:
         """Read the whole training split's poses, without decoding an image.
@@ -152,7 +136,7 @@ class PoseDataModule(L.LightningDataModule):
         Raises:
             InputError: where there is none.
         """
-        return self._read("train")[0]
+        return self.scene.read("train")[0]
 
     def chosen_training_frames(self) -> Frames:
         """Read the poses of those training frames that are neither held out nor thinned away, without an image.
@@ -160,36 +144,15 @@ class PoseDataModule(L.LightningDataModule):
         Raises:
             InputError: where there is none.
         """
-        return self._chosen()[0]
+        return self.scene.choose()[0][0]
 
-    def frames(self, part: Part) -> Frames:
+    def frames(self, part: Split) -> Frames:
         """Return the frames of a part, in the order of ``PoseBatch.index``."""
-        return self._loaded[part].data.frames
+        return self.scene.parts[part].data.frames
 
     def describe(self) -> dict[str, Any]:
         """Say which frames a number comes from: scene, counts, selection rule, what was left out and repaired."""
-        hparams, rendered = self.hparams, is_rendered(self.folder)
-        official = not rendered and is_official(hparams["dataset"], hparams["scene"], self._listed)
-        return {
-            "dataset": hparams["dataset"],
-            "scene": self.folder.name,
-            "official_split": official,
-            "rendered": rendered,
-            "listed_frames": dict(self._listed),
-            **{f"{part}_frames": len(loaded.data.frames) for part, loaded in self._loaded.items()},
-            "fingerprints": {part: loaded.fingerprint for part, loaded in self._loaded.items()},
-            "skipped": {part: loaded.bad.counts() for part, loaded in self._loaded.items()},
-            "repaired": {part: len(loaded.bad.repaired) for part, loaded in self._loaded.items()},
-            "validation": hparams["validation"],
-            "keep_every": hparams["keep_every"],
-            "keep_count": hparams["keep_count"],
-            "clip_length": hparams["clip_length"],
-            "clip_skip": hparams["clip_skip"],
-            "image_size": list(self.crop),
-            "short_side": hparams["short_side"],
-            **describe_points(self._loaded),
-            **(describe_capture(self.folder) if hparams["dataset"] == CAPTURE else {}),
-        }
+        return self.scene.describe()
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         """Shuffled training batches."""
@@ -197,7 +160,7 @@ class PoseDataModule(L.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
         """Validation batches in order; none under ``validation: none``."""
-        return self._loader("val", self.hparams["eval_batch_size"]) if "val" in self._loaded else []
+        return self._loader("val", self.hparams["eval_batch_size"]) if "val" in self.scene.parts else []
 
     def test_dataloader(self) -> DataLoader[PoseBatch]:
         """Test batches in order."""
@@ -207,14 +170,14 @@ class PoseDataModule(L.LightningDataModule):
         """Test batches in order, for predictions without errors."""
         return self.test_dataloader()
 
-    def centred_images(self, part: Part, most: int | None = None) -> Iterator[Tensor]:
+    def centred_images(self, part: Split, most: int | None = None) -> Iterator[Tensor]:
         """Centre crops of a part's frames in the order of ``PoseBatch.index``, (B, 3, H, W) in 0..1.
 
         Args:
             part: of those that are set up.
             most: so many at most, evenly spread; all of them unless given.
         """
-        images, size = self._loaded[part].data.images, self.hparams["eval_batch_size"]
+        images, size = self.scene.parts[part].data.images, self.hparams["eval_batch_size"]
         rows = np.linspace(0, len(images) - 1, min(most or len(images), len(images))).round().astype(int)
         for start in range(0, len(rows), size):
             yield center_crop(torch.from_numpy(images[rows[start : start + size]]), self.crop)
@@ -238,71 +201,17 @@ class PoseDataModule(L.LightningDataModule):
         """What ``focal_ratio`` comes to in this scene."""
         if self.hparams["focal_ratio"] != "scene":
             return self.hparams["focal_ratio"]
-        return focal_ratio_of(self.folder) if self.hparams["dataset"] == CAPTURE else None
+        return self.scene.focal_ratio()
 
     def _epoch_uniforms(self, epoch: int, device: torch.device) -> Tensor:
         """An epoch's chances of every training frame, drawn and sent to the device once."""
         drawn_for = (provenance.seed(), epoch, device)
         if self._uniforms is None or self._uniforms[0] != drawn_for:
-            uniforms = draw_uniforms(provenance.seed(), epoch, len(self._loaded["train"].data.frames))
+            uniforms = draw_uniforms(provenance.seed(), epoch, len(self.scene.parts["train"].data.frames))
             self._uniforms = (drawn_for, uniforms.to(device))
         return self._uniforms[1]
 
-    def _read(self, split: Split) -> tuple[Frames, BadFrames]:
-        bad = BadFrames(self.hparams["on_bad_frame"])
-        folder = self.folder  # first of all: an unknown dataset is told here
-        frames = DATASETS[self.hparams["dataset"]].read_split(folder, split, bad)
-        self._listed[split] = len(frames) + len(bad.rejected)
-        return frames, bad
-
-    def _decode(self, frames: Frames, bad: BadFrames) -> LoadedSplit:
-        return load_split(frames, bad, self.hparams["short_side"], self.crop, self.hparams["cache_dir"])
-
-    def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
-        """Add what each frame may see, of the frames that could be decoded."""
-        count, data = self.hparams["points_per_frame"], loaded.data
-        if count == 0:
-            return loaded
-        points = read_points(self.folder, data.frames, count, provenance.seed())
-        return replace(loaded, data=CachedFrames(data.frames, data.images, points))
-
-    def _in_clips(self, loaded: LoadedSplit, thinned_by: float) -> LoadedSplit:
-        """Make an item of each clip; neighbours of a thinned sequence lie farther apart already."""
-        length, data = self.hparams["clip_length"], loaded.data
-        if length == 1:
-            return loaded
-        clips = clips_of(data.frames, length, max(1, round(self.hparams["clip_skip"] / thinned_by)))
-        return replace(loaded, data=CachedFrames(data.frames, data.images, data.points, clips))
-
-    def _load_train_and_val(self) -> None:
-        train, val, thinned_by, bad = self._chosen()
-        if val is not None:
-            self._loaded["val"] = self._with_points(self._decode(*val))
-        self._loaded["train"] = self._in_clips(self._with_points(self._decode(train, bad)), thinned_by)
-
-    def _chosen(self) -> tuple[Frames, tuple[Frames, BadFrames] | None, float, BadFrames]:
-        """Frames to train on, those to validate on, how many to one were thinned, and what was left out of either."""
-        train, bad = self._read("train")
-        validation = self.hparams["validation"]
-        val = self._marked() if validation in ("auto", "marked") else None
-        if val is None and validation not in ("none", "test_set"):
-            options = {name: self.hparams[f"val_{name}"] for name in ("fraction", "gap", "sequences")}
-            train_rows, val_rows = hold_out(train, validation, **options)
-            train, val = train.select(train_rows), (train.select(val_rows), BadFrames(bad.policy))
-        kept = subsample(train, self.hparams["keep_every"], self.hparams["keep_count"])
-        return train.select(kept), val, len(train) / len(kept), bad
-
-    def _marked(self) -> tuple[Frames, BadFrames] | None:
-        """Frames that the scene marks for validation, and what was left out of them."""
-        if DATASETS[self.hparams["dataset"]].marks_validation:
-            frames, bad = self._read("val")
-            if len(frames):
-                return frames, bad
-        if self.hparams["validation"] == "marked":
-            raise InputError(f"data.validation marked: {self.folder} marks no frames as val; use auto, or none")
-        return None
-
-    def _loader(self, part: Part, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
+    def _loader(self, part: Split, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._data(part), self.trainer
         workers = 0 if data.resident is not None else self.hparams["num_workers"]
         # One sampler everywhere: Lightning gives it the epoch, so order depends on (seed, epoch) alone.
@@ -326,16 +235,16 @@ class PoseDataModule(L.LightningDataModule):
             persistent_workers=workers > 0,
         )
 
-    def _data(self, part: Part) -> CachedFrames:
+    def _data(self, part: Split) -> CachedFrames:
         """A part's frames, in the device's memory if they are to be there."""
-        data, resident = self._loaded[part].data, self._resident.get(part)
+        data, resident = self.scene.parts[part].data, self._resident.get(part)
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
         if resident is not None and resident.position_m.device == device:
             return resident
         wanted = self.hparams["resident"]
         if wanted is None:
             needed = sum(
-                loaded.data.images.nbytes for name, loaded in self._loaded.items() if name not in self._resident
+                loaded.data.images.nbytes for name, loaded in self.scene.parts.items() if name not in self._resident
             )
             wanted = device.type == "cuda" and 2 * needed <= torch.cuda.mem_get_info(device)[0]
         if not wanted:

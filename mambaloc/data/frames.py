@@ -17,6 +17,18 @@ Split = Literal["train", "val", "test"]
 """Imported scenes mark frames for validation; the benchmarks have none."""
 OnBadFrame = Literal["error", "skip"]
 
+FARTHEST = 1e7
+"""Largest coordinate of a camera, in whatever unit a scene has: beyond, float32 is off by one unit."""
+
+FARTHEST_M = 1e5
+"""Largest coordinate in a place that is measured in metres: a label or a point beyond is an error or noise."""
+
+UNIT_TOLERANCE = 1e-3
+"""How far a quaternion's length may be from 1, where a file's decimals have rounded it."""
+
+ROTATION_TOLERANCE = 1e-2
+"""How far entries of ``R R^T`` may be from the identity's, where a file's decimals have rounded a rotation ``R``."""
+
 
 @dataclass(frozen=True)
 class Rejection:

@@ -15,7 +15,7 @@ from rich.progress import track
 
 from mambaloc.errors import InputError
 from mambaloc.rendering import GENERATOR_VERSION, default_intrinsics, embedded_room, embedded_walk, render, sensor
-from mambaloc.rendering.poses import quaternion_from_matrix
+from mambaloc.runtime.rotations import quaternion_from_matrix
 from mambaloc.user_cache import made_once
 
 FILM_FILE, POSES_FILE = "film.webm", "film.json"

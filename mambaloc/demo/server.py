@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import ssl
 import sys
-import threading
 from contextlib import suppress
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -21,7 +19,6 @@ from mambaloc.demo.site import build_site
 from mambaloc.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-MOST_CONNECTIONS = 64
 _TYPES = {".js": "text/javascript", ".mjs": "text/javascript", ".wasm": "application/wasm", ".webm": "video/webm"}
 _HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",  # this and the next: WebAssembly has threads
@@ -87,33 +84,13 @@ def serve(site: Path, port: int, host: str = LOOPBACK, tls: ssl.SSLContext | Non
 
 
 class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    request_queue_size = 128
+    request_queue_size = 128  # with the default of 5, one of many at once waits for seconds to be let in
     allow_reuse_address = os.name != "nt"  # where it would let two servers share a port
 
     def server_bind(self) -> None:
         """Bind without asking the network for this machine's name, as the base does: that can take seconds."""
-        self._open: dict[socket.socket, None] = {}  # in the order in which they came
-        self._lock = threading.Lock()
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread; of too many connections the oldest makes room, whether it is silent or slow."""
-        with self._lock:
-            self._open[request] = None
-            oldest = next(iter(self._open))
-            if len(self._open) > MOST_CONNECTIONS:
-                del self._open[oldest]
-                with suppress(OSError):  # it hung up itself
-                    oldest.shutdown(socket.SHUT_RDWR)
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        """Close a connection that has its answers."""
-        with self._lock:
-            self._open.pop(request, None)
-        super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Keep quiet of browsers that hang up, or do not trust the certificate yet."""
@@ -121,7 +98,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(SimpleHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    timeout = 60  # of a connection that says nothing
+    timeout = 60  # seconds that a connection may say nothing
     extensions_map = SimpleHTTPRequestHandler.extensions_map | _TYPES
 
     def end_headers(self) -> None:

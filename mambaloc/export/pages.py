@@ -7,7 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from mambaloc.data.download.origins import licence_of_weights
+from mambaloc.data.datasets.registry import licence_of_weights
 from mambaloc.runtime.contract import Contract
 
 TARGETS = ("android", "ios", "react_native", "web", "pc")

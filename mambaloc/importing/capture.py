@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 Unit = Literal["metre", "unknown"]
 
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes of OpenGL, ARKit and ARCore (x right, y up, z backwards) in OpenCV's, and the other way."""
+
 
 @dataclass(frozen=True)
 class Camera:

@@ -61,17 +61,22 @@ def import_scene(
             f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
         )
     capture = read_capture(source, kind)
-    broken = sanity.bad_poses(capture.world_from_cam)
-    left_out = {str(capture.images[row]): rule for row, rule in broken.items()}
-    capture = selected(capture, [row for row in range(len(capture.images)) if row not in broken])
+    capture, broken = _without(capture, sanity.bad_poses(capture.world_from_cam))
     capture = _near_the_origin(_in_metres(capture, metres_per_unit))
+    capture, far = _without(capture, sanity.far_poses(capture.world_from_cam))
     with whole_folder(out, "choose another folder with --out") as partial:
         written, sizes, rules = write_pictures(capture, partial)
-        imported = _checked(written, capture.cameras, sizes, {**left_out, **rules}, split)
+        imported = _checked(written, capture.cameras, sizes, {**broken, **far, **rules}, split)
         write_frames(imported, partial)
         write_report(imported, partial, out.name)
         write_scene(imported, partial, source, command)
     return imported
+
+
+def _without(capture: Capture, rules: Mapping[int, str]) -> tuple[Capture, dict[str, str]]:
+    """A capture without some rows, and the rule that each of them breaks, by file."""
+    kept = selected(capture, [row for row in range(len(capture.images)) if row not in rules])
+    return kept, {str(capture.images[row]): rule for row, rule in rules.items()}
 
 
 def _in_metres(capture: Capture, metres_per_unit: float | None) -> Capture:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from mambaloc.geometry import quaternion_from_matrix, rotation_error_deg
 from mambaloc.importing.capture import Capture
+from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.float64]
 
@@ -19,6 +18,7 @@ _JUMP_DEG = 45.0
 _LONGEST_STEP = 0.25  # of the extent: a path's steps are shorter; two frames drawn at random lie farther apart
 _LEAST_STEP = 1e-4  # of the extent
 _LEAST_DEG = 0.05
+_PAIRS_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def motion_of(capture: Capture) -> Motion:
     names = np.array(capture.sequences)
     later = 1 + np.flatnonzero(names[1:] == names[:-1])
     length = np.linalg.norm(position[later] - position[later - 1], axis=1)
-    turn_deg = _angles_deg(quaternion[later], quaternion[later - 1])
+    turn_deg = rotation_error_deg(quaternion[later], quaternion[later - 1])
     low, high = np.percentile(position, (5, 95), axis=0)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(position, axis=0)))
     in_order = len(later) > 0 and float(np.median(length)) <= _LONGEST_STEP * extent
@@ -81,16 +81,20 @@ def motion_of(capture: Capture) -> Motion:
 
 def quaternions(capture: Capture) -> Floats:
     """Rotations of a capture's cameras, canonical wxyz, (N, 4)."""
-    return quaternion_from_matrix(torch.from_numpy(capture.world_from_cam[:, :3, :3].copy())).numpy()
+    return quaternion_from_matrix(capture.world_from_cam[:, :3, :3])
 
 
 def apart(
     position: Floats, quaternion: Floats, rows: NDArray[np.int64], others: NDArray[np.int64]
 ) -> tuple[Floats, Floats]:
     """How far each of some frames is from each of others: lengths and degrees, (R, O) each."""
-    length = np.linalg.norm(position[rows][:, None] - position[others], axis=-1)
-    cosine = np.abs(quaternion[rows] @ quaternion[others].T).clip(max=1.0)
-    return length, np.degrees(2 * np.arccos(cosine))
+    length, turn_deg = np.empty((2, len(rows), len(others)))
+    at_once = max(1, _PAIRS_AT_ONCE // max(1, len(others)))
+    for start in range(0, len(rows), at_once):
+        block = slice(start, start + at_once)
+        length[block] = np.linalg.norm(position[rows[block], None] - position[others], axis=-1)
+        turn_deg[block] = rotation_error_deg(quaternion[rows[block], None], quaternion[others])
+    return length, turn_deg
 
 
 def _to_nearest(position: Floats, quaternion: Floats) -> tuple[float, float]:
@@ -104,7 +108,3 @@ def _to_nearest(position: Floats, quaternion: Floats) -> tuple[float, float]:
         lengths.append(length[nearest])
         turns.append(turn_deg[nearest])
     return float(np.median(lengths)), float(np.median(turns))
-
-
-def _angles_deg(a: Floats, b: Floats) -> Floats:
-    return rotation_error_deg(torch.from_numpy(a), torch.from_numpy(b)).numpy()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mambaloc.rendering.poses import looking
 from mambaloc.rendering.quads import Vectors
 
 _KNOT_DEG = 30.0  # how far the view turns between two way points
@@ -46,6 +45,27 @@ def smooth_trajectory(
     unit = ring * [0.55, 0.55, 0] + sway * [0.445, 0.445, 0.98] + tremor[:, 3:] * [0.005, 0.005, 0.02]
     lower, upper = np.asarray(inside_m, dtype=float)
     return looking((lower + upper) / 2 + unit * (upper - lower) / 2, azimuth, pitch, roll)
+
+
+def looking(position_m: ArrayLike, azimuth_rad: ArrayLike, pitch_rad: ArrayLike, roll_rad: ArrayLike) -> Vectors:
+    """Poses ``world_from_cam`` (N, 4, 4) in a world whose ``z`` is up.
+
+    Args:
+        position_m: (N, 3) camera centres, metres.
+        azimuth_rad: (N,) direction of view about ``z``, from ``x`` towards ``y``.
+        pitch_rad: (N,) upwards from the horizon.
+        roll_rad: (N,) clockwise about the direction of view.
+    """
+    a, p, r = (np.asarray(angle, dtype=float) for angle in (azimuth_rad, pitch_rad, roll_rad))
+    forward = np.stack([np.cos(p) * np.cos(a), np.cos(p) * np.sin(a), np.sin(p)], axis=-1)
+    level_right = np.stack([np.sin(a), -np.cos(a), np.zeros_like(a)], axis=-1)
+    level_down = np.cross(forward, level_right)
+    cos_r, sin_r = np.cos(r)[:, None], np.sin(r)[:, None]
+    right = cos_r * level_right + sin_r * level_down
+    world_from_cam = np.tile(np.eye(4), (len(a), 1, 1))
+    world_from_cam[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    world_from_cam[:, :3, 3] = position_m
+    return world_from_cam
 
 
 def _spline_noise(rng: np.random.Generator, knots: Vectors, channels: int) -> Vectors:

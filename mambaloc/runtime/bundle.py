@@ -9,11 +9,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.files import sha256
 from mambaloc.runtime.localiser import Localiser
+from mambaloc.runtime.rotations import rotation_error_deg
 
 CONTRACT_FILE = "contract.json"
 
@@ -61,13 +61,6 @@ def verify_bundle(folder: Path, threads: int | None = None) -> list[Deviation]:
         raise InputError(f"{path}: is no bundle's contract ({reason}); write the bundle anew") from None
 
 
-def rotation_deg(a: NDArray[np.floating[Any]], b: NDArray[np.floating[Any]]) -> float:
-    """Angle between two unit quaternions' rotations."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    near, far = sorted((np.linalg.norm(a - b), np.linalg.norm(a + b)))
-    return float(np.degrees(4 * np.arctan2(near, far)))
-
-
 def _check(folder: Path, name: str, digest: str) -> None:
     path, parts = folder / name, PurePosixPath(name).parts
     # By its words, too: who copies the bundle joins them with another folder.
@@ -96,5 +89,5 @@ def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None
     found = [localiser.localise(model.parent / frame["file"]) for frame in frames]
     pairs = list(zip(found, frames, strict=True))
     position_mm = max(1000 * float(np.linalg.norm(p.position_m - np.array(frame["position_m"]))) for p, frame in pairs)
-    angle_deg = max(rotation_deg(p.quaternion, np.array(frame["quaternion_wxyz"])) for p, frame in pairs)
+    angle_deg = max(float(rotation_error_deg(p.quaternion, frame["quaternion_wxyz"])) for p, frame in pairs)
     return position_mm, angle_deg, 1000 * float(np.median([pose.latency_s for pose in found]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb, read_image, resized_size
 from mambaloc.runtime.contract import METADATA_KEY, MODEL_FILES, Contract
-from mambaloc.runtime.sources import frames_of
+from mambaloc.runtime.sources import SourceFrame, frames_of
 
 
 @dataclass(frozen=True)
@@ -90,16 +90,16 @@ class Localiser:
         taken_s, (position_m, quaternion, *uncertainty) = time.perf_counter() - start, (each[0] for each in said)
         return Localisation(position_m, quaternion, taken_s, *map(float, uncertainty))
 
-    def localise_each(self, source: str | Path) -> Iterator[tuple[float, Localisation]]:
+    def localise_each(self, source: str | Path | Iterable[SourceFrame]) -> Iterator[tuple[float, Localisation]]:
         """Localise a source's frames one after another, each with its time in seconds since the first.
 
         Args:
-            source: a video, a folder of pictures, whose times are their places in the list, or a camera's number.
+            source: as :func:`~mambaloc.runtime.sources.frames_of` takes it, or the frames that it gives.
 
         Raises:
             InputError: where there is no such source, or a frame cannot be localised.
         """
-        for frame in frames_of(source)[0]:
+        for frame in frames_of(source)[0] if isinstance(source, str | Path) else source:
             yield frame.time_s, self.localise(frame.image)
 
     def _check_input(self) -> None:

@@ -3,13 +3,13 @@
 An error-state Kalman filter (Solà 2017, *Quaternion kinematics for the error-state Kalman filter*): the state is
 position, velocity, rotation and angular velocity; its error is a vector of 12 whose rotation lies in the camera's own
 axes. The smoother goes back over what the filter found (Rauch, Tung and Striebel 1965).
+filterpy is not used: its filters have Euclidean states only, and no error state for a rotation.
 
 A network errs alike on frames that look alike, so its errors are not white: filtering takes away jitter and leaps, but
 little of the error that neighbours share.
 
 Convention
-    Poses are ``world_from_cam``; quaternions are wxyz, of either sign and any length. Times are seconds: those of a
-    folder's pictures, which are places in a list, are to be divided by the rate they were taken at.
+    Poses are ``world_from_cam``; quaternions are wxyz, of either sign and any length. Times are seconds.
     Covariances (12, 12) are of the error: position [m], velocity [m/s], rotation [rad] and angular velocity [rad/s],
     these two in the camera's axes.
 """
@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.runtime.filter_noise import Noise
+from mambaloc.runtime.rotations import canonical, multiply, quaternion_from_rotation_vector, rotation_vector_between
 
 Array = NDArray[np.float64]
-
-PICTURES_HZ = 30.0  # what tools take the rate of a folder's pictures to be
 
 _POSITION, _VELOCITY, _ROTATION, _TURN = (slice(start, start + 3) for start in range(0, 12, 3))
 _MEASURED, _RATES = np.r_[_POSITION, _ROTATION], np.r_[_VELOCITY, _TURN]
@@ -36,67 +36,6 @@ _GATE = 22.46  # squared Mahalanobis distance beyond which lies one good pose of
 _PATIENCE = 5  # poses left out in a row, the last of which is a new beginning
 _FIRST_SPEED_M_S, _FIRST_TURN_RAD_S = 2.0, 1.0  # deviations where nothing is known yet: a brisk walk, a quick turn
 _LEARNT_EVERY, _LEARNT_FROM = 20, 300  # poses
-
-
-@dataclass(frozen=True)
-class Noise:
-    """What a filter believes of poses and of motion: standard deviations along each axis.
-
-    The defaults of motion are a hand's: what the true trajectories of 7-Scenes' training sequences do in half a second,
-    which is much alike in all seven scenes (0.15 to 0.25 m/s², 13 to 25 deg/s²).
-
-    Args:
-        position_m: error of a measured position.
-        rotation_deg: of a measured rotation.
-        acceleration_m_s2: averaged over a second; it is white, so over a quarter of one it is twice as much.
-        acceleration_deg_s2: of the rotation, likewise.
-
-    Raises:
-        InputError: for one that is no positive number.
-    """
-
-    position_m: float = 0.2
-    rotation_deg: float = 6.0
-    acceleration_m_s2: float = 0.2
-    acceleration_deg_s2: float = 15.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < np.inf:
-                raise InputError(f"Noise({name}={value}): is a standard deviation; give a positive number")
-
-    @classmethod
-    def learned(cls, time_s: Array, position_m: Array, quaternion: Array) -> Noise:
-        """What errors a video's poses seem to have where a hand moves the camera.
-
-        A pose's distance from the line between those a quarter of a second before and after shows an error, less what
-        motion adds. The far fifth of distances are outliers, and errors are twice what the others show, as much of them
-        is common to all three (half or twice as much made little difference on frames held out, and on rendered ones).
-
-        Args:
-            time_s: (N,), in order; N is 3 or more.
-            position_m: (N, 3), finite.
-            quaternion: (N, 4), unit.
-        """
-        step_s = max(float(np.median(np.diff(time_s))), 1e-6)
-        apart = int(np.clip(round(0.25 / step_s), 1, (len(time_s) - 1) // 2))
-        first, middle, last = slice(None, -2 * apart), slice(apart, -apart), slice(2 * apart, None)
-        before_s, after_s = time_s[middle] - time_s[first], time_s[last] - time_s[middle]
-        whole_s = np.maximum(before_s + after_s, 1e-6)
-        share = before_s / whole_s
-        line_m = position_m[first].T * (1 - share) + position_m[last].T * share
-        q_first, q_middle, q_last = quaternion[first].T, quaternion[middle].T, quaternion[last].T
-        line = _multiply(q_first, _exp(share * _log(_multiply(_conjugate(q_first), q_last))))
-        off_m, off_deg = position_m[middle].T - line_m, np.degrees(_log(_multiply(_conjugate(line), q_middle)))
-
-        errors = 1 + np.median(share**2 + (1 - share) ** 2)  # of three poses, in that of one: variance
-        motions = np.median(before_s**2 * after_s**2 / (3 * whole_s))  # of white acceleration, likewise
-        found = []
-        for off, acceleration in ((off_m, cls.acceleration_m_s2), (off_deg, cls.acceleration_deg_s2)):
-            shown = (np.quantile(np.abs(off), 0.8) / 1.2816) ** 2  # four fifths of normal numbers lie within 1.28
-            found.append(2 * np.sqrt(max(shown - motions * acceleration**2, shown / 4) / errors))
-        # No such model is nearer than these, and poses off by more than 15 degrees are outliers wherever they are many.
-        return cls(max(found[0], 0.02), float(np.clip(found[1], 1, 15)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +165,7 @@ def _went_back(filtered: Sequence[PoseEstimate], track: Sequence[_Measured], noi
         gain = np.linalg.solve(predicted.covariance, motion @ before.covariance).T
         kept = np.eye(12) - gain @ motion
         covariance = kept @ before.covariance @ kept.T + gain @ (after.covariance + wander) @ gain.T
-        turned = _log(_multiply(_conjugate(predicted.quaternion), after.quaternion))
+        turned = rotation_vector_between(predicted.quaternion, after.quaternion)
         rates = after.velocity_m_s - predicted.velocity_m_s, after.turn_rad_s - predicted.turn_rad_s
         error = np.concatenate((after.position_m - predicted.position_m, rates[0], turned, rates[1]))
         smoothed.append(_moved(before, gain @ error, covariance))
@@ -264,7 +203,7 @@ def _begun(measured: _Measured, noise: Noise) -> PoseEstimate:
         raise InputError(f"pose at {measured.time_s} s: not finite, and the filter would begin with it; leave it out")
     deviations = noise.position_m, _FIRST_SPEED_M_S, np.radians(noise.rotation_deg), _FIRST_TURN_RAD_S
     covariance, still = np.diag(np.square(np.repeat(deviations, 3))), np.zeros(3)
-    return PoseEstimate(measured.position_m, _canonical(measured.quaternion), still, still, covariance, begins=True)
+    return PoseEstimate(measured.position_m, canonical(measured.quaternion), still, still, covariance, begins=True)
 
 
 def _predicted(estimate: PoseEstimate, step_s: float, noise: Noise) -> tuple[PoseEstimate, Array, Array]:
@@ -280,7 +219,7 @@ def _predicted(estimate: PoseEstimate, step_s: float, noise: Noise) -> tuple[Pos
     moved = replace(
         estimate,
         position_m=estimate.position_m + step_s * estimate.velocity_m_s,
-        quaternion=_canonical(_multiply(estimate.quaternion, _exp(turned))),
+        quaternion=canonical(multiply(estimate.quaternion, quaternion_from_rotation_vector(turned))),
         covariance=motion @ estimate.covariance @ motion.T + wander,
         is_outlier=False,
         begins=False,
@@ -290,7 +229,7 @@ def _predicted(estimate: PoseEstimate, step_s: float, noise: Noise) -> tuple[Pos
 
 def _corrected(predicted: PoseEstimate, measured: _Measured, noise: Noise) -> PoseEstimate:
     """Take the measured pose in, unless it is an outlier."""
-    turned = _log(_multiply(_conjugate(predicted.quaternion), measured.quaternion))
+    turned = rotation_vector_between(predicted.quaternion, measured.quaternion)
     innovation = np.concatenate((measured.position_m - predicted.position_m, turned))
     errors = np.diag(np.square(np.repeat((noise.position_m, np.radians(noise.rotation_deg)), 3)))
     information = np.linalg.inv(predicted.covariance[_MEASURED[:, None], _MEASURED] + errors)
@@ -309,42 +248,7 @@ def _moved(estimate: PoseEstimate, error: Array, covariance: Array) -> PoseEstim
         estimate,
         position_m=estimate.position_m + error[_POSITION],
         velocity_m_s=estimate.velocity_m_s + error[_VELOCITY],
-        quaternion=_canonical(_multiply(estimate.quaternion, _exp(error[_ROTATION]))),
+        quaternion=canonical(multiply(estimate.quaternion, quaternion_from_rotation_vector(error[_ROTATION]))),
         turn_rad_s=estimate.turn_rad_s + error[_TURN],
         covariance=(covariance + covariance.T) / 2,
     )
-
-
-def _multiply(a: Array, b: Array) -> Array:
-    """Hamilton product: (4, ...), (4, ...) -> (4, ...)."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
-    return np.array(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        )
-    )
-
-
-def _conjugate(quaternion: Array) -> Array:
-    return np.array((quaternion[0], *-quaternion[1:]))
-
-
-def _canonical(quaternion: Array) -> Array:
-    """Unit, ``w >= 0``."""
-    return quaternion / np.copysign(np.sqrt(quaternion @ quaternion), quaternion[0])
-
-
-def _exp(rotation_rad: Array) -> Array:
-    """The quaternion of a rotation vector: (3, ...) -> (4, ...)."""
-    half_rad = np.sqrt((rotation_rad**2).sum(0)) / 2
-    return np.array((np.cos(half_rad), *(np.sinc(half_rad / np.pi) / 2 * rotation_rad)))
-
-
-def _log(quaternion: Array) -> Array:
-    """The shortest rotation vector of a unit quaternion of either sign: (4, ...) -> (3, ...)."""
-    sine = np.sqrt((quaternion[1:] ** 2).sum(0))
-    angle_rad = np.copysign(2 * np.arctan2(sine, np.abs(quaternion[0])), quaternion[0])
-    return angle_rad / np.maximum(sine, np.finfo(sine.dtype).tiny) * quaternion[1:]

@@ -14,6 +14,17 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
+_HAMILTON = np.array(  # what a_i b_j adds to component k of a product
+    [
+        [[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, -1]],
+        [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+        [[0, 0, 1, 0], [0, 0, 0, -1], [1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]],
+    ]
+)
+_SIGN_WEIGHTS = np.array([8.0, 4.0, 2.0, 1.0])  # each outvotes all that follow it
+_TINY = np.finfo(np.float64).tiny
+
 
 def canonical(quaternion: ArrayLike) -> Floats:
     """Choose between ``q`` and ``-q``: unit length, and the first non-zero of w, x, y, z positive.
@@ -22,9 +33,8 @@ def canonical(quaternion: ArrayLike) -> Floats:
         (..., 4), of any length but 0 -> (..., 4).
     """
     q = np.asarray(quaternion, np.float64)
-    unit = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    is_flipped = np.sign(unit) @ (8.0, 4.0, 2.0, 1.0) < 0  # each weight outvotes all that follow it
-    return np.where(is_flipped[..., None], -unit, unit)
+    scaled = q / np.abs(q).max(axis=-1, keepdims=True)  # squares stay in range, and digits those of mambaloc.geometry
+    return scaled / np.copysign(_length(scaled), (np.sign(q) @ _SIGN_WEIGHTS)[..., None])
 
 
 def conjugate(quaternion: ArrayLike) -> Floats:
@@ -38,21 +48,13 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Floats:
     Shape:
         (..., 4), (..., 4) -> (..., 4). Lengths multiply; signs are kept as they fall.
     """
-    aw, ax, ay, az = np.moveaxis(np.asarray(a, np.float64), -1, 0)
-    bw, bx, by, bz = np.moveaxis(np.asarray(b, np.float64), -1, 0)
-    product = (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-    return np.stack(product, axis=-1)
+    return np.einsum("kij,...i,...j->...k", _HAMILTON, np.asarray(a, np.float64), np.asarray(b, np.float64))
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Floats:
     """Rotation matrices of quaternions of any length but 0; (..., 4) -> (..., 3, 3)."""
     q = np.asarray(quaternion, np.float64)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    w, x, y, z = np.moveaxis(q / _length(q), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -89,16 +91,21 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Floats:
 def quaternion_from_rotation_vector(rotation_rad: ArrayLike) -> Floats:
     """Exponential map: the quaternion of an axis times an angle; (..., 3), radians -> (..., 4)."""
     vector = np.asarray(rotation_rad, np.float64)
-    half_rad = np.linalg.norm(vector, axis=-1, keepdims=True) / 2
-    return np.concatenate((np.cos(half_rad), np.sinc(half_rad / np.pi) / 2 * vector), axis=-1)
+    half_rad = _length(vector) / 2
+    return np.concatenate((np.cos(half_rad), np.sin(half_rad) / np.maximum(2 * half_rad, _TINY) * vector), axis=-1)
 
 
 def rotation_vector_from_quaternion(quaternion: ArrayLike) -> Floats:
     """Logarithm map: the shortest rotation vector of unit quaternions of either sign; (..., 4) -> (..., 3), radians."""
     q = np.asarray(quaternion, np.float64)
-    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    sine = _length(q[..., 1:])
     angle_rad = np.copysign(2 * np.arctan2(sine, np.abs(q[..., :1])), q[..., :1])
-    return angle_rad / np.maximum(sine, np.finfo(sine.dtype).tiny) * q[..., 1:]
+    return angle_rad / np.maximum(sine, _TINY) * q[..., 1:]
+
+
+def rotation_vector_between(a: ArrayLike, b: ArrayLike) -> Floats:
+    """Rotation vector, in ``a``'s own axes, that turns ``a`` into ``b``; (..., 4), (..., 4) -> (..., 3), radians."""
+    return rotation_vector_from_quaternion(multiply(conjugate(a), b))
 
 
 def rotation_error_deg(a: ArrayLike, b: ArrayLike) -> Floats:
@@ -121,3 +128,8 @@ def is_rotation(matrix: ArrayLike, tolerance: float = 1e-3) -> NDArray[Any]:
         off = np.abs(m @ np.swapaxes(m, -1, -2) - np.eye(3)).max(axis=(-2, -1))
         handedness = (np.cross(m[..., 0, :], m[..., 1, :]) * m[..., 2, :]).sum(axis=-1)
     return (off <= tolerance) & (handedness > 0)  # NaN compares false
+
+
+def _length(vector: Floats) -> Floats:
+    """Norms (..., 1) of vectors (..., N); for a single one in half the time of ``np.linalg.norm``."""
+    return np.sqrt((vector * vector).sum(axis=-1, keepdims=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +14,9 @@ import cv2
 from mambaloc.errors import InputError
 from mambaloc.images import PICTURES, Image, read_image
 
+PICTURES_HZ = 30.0
+"""The rate at which a folder's pictures are taken to follow one another, as their files do not say it."""
+
 
 @dataclass(frozen=True)
 class SourceFrame:
@@ -20,7 +24,7 @@ class SourceFrame:
 
     Args:
         name: file, or number in the video.
-        time_s: since the first frame; of pictures, their place in the list.
+        time_s: seconds since the first frame.
         image: RGB, (H, W, 3).
     """
 
@@ -29,15 +33,18 @@ class SourceFrame:
     image: Image
 
 
-def frames_of(source: str | Path) -> tuple[Iterator[SourceFrame], int | None]:
+def frames_of(source: str | Path, pictures_hz: float = PICTURES_HZ) -> tuple[Iterator[SourceFrame], int | None]:
     """Open a source; return its frames, and how many there are where that is known.
 
     Args:
         source: a video file, a picture, a folder of pictures (by name), or the number of a camera.
+        pictures_hz: frames per second of a folder of pictures; a video and a camera have their own times.
 
     Raises:
-        InputError: where there is no such source, or nothing in it.
+        InputError: where there is no such source, it is empty, or ``pictures_hz`` is not positive.
     """
+    if not 0 < pictures_hz < math.inf:
+        raise InputError(f"pictures_hz={pictures_hz}: must be a positive number of frames per second; correct it")
     if str(source).isdecimal():
         return _of_capture(_opened(int(str(source)), f"camera {source}"), live=True), None
     path = Path(source)
@@ -45,19 +52,19 @@ def frames_of(source: str | Path) -> tuple[Iterator[SourceFrame], int | None]:
         pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES and ".depth." not in p.name)
         if not pictures:
             raise InputError(f"{path}: holds no picture ({', '.join(PICTURES)}); give a folder of them or a video")
-        return _of_pictures(pictures), len(pictures)
+        return _of_pictures(pictures, pictures_hz), len(pictures)
     if not path.is_file():
         raise InputError(f"{path}: no such file, folder or camera; a camera is a number, as 0")
     if path.suffix.lower() in PICTURES:
-        return _of_pictures([path]), 1
+        return _of_pictures([path], pictures_hz), 1
     capture = _opened(str(path), str(path))
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     return _of_capture(capture), count if count > 0 else None
 
 
-def _of_pictures(paths: list[Path]) -> Iterator[SourceFrame]:
+def _of_pictures(paths: list[Path], rate_hz: float) -> Iterator[SourceFrame]:
     for number, path in enumerate(paths):
-        yield SourceFrame(path.name, float(number), read_image(path))
+        yield SourceFrame(path.name, number / rate_hz, read_image(path))
 
 
 def _opened(what: str | int, name: str) -> cv2.VideoCapture:

@@ -1,9 +1,11 @@
-"""Matrices of trainings: read, run cell by cell on one machine or many, and kept with where each number comes from."""
+"""Sweeps of trainings: run trial by trial on one machine or many, each result kept with where it comes from.
 
-from mambaloc.sweep.cells import Cell, Matrix, read_matrix
+Running needs no torch; :mod:`mambaloc.sweep.report`, which reads results, does.
+"""
+
 from mambaloc.sweep.progress import print_plan
-from mambaloc.sweep.report import write_report
-from mambaloc.sweep.running import run_matrix
-from mambaloc.sweep.store import Store, StoredCell
+from mambaloc.sweep.running import run_sweep
+from mambaloc.sweep.store import Store, StoredTrial
+from mambaloc.sweep.trials import Sweep, Trial, read_sweep
 
-__all__ = ["Cell", "Matrix", "Store", "StoredCell", "print_plan", "read_matrix", "run_matrix", "write_report"]
+__all__ = ["Store", "StoredTrial", "Sweep", "Trial", "print_plan", "read_sweep", "run_sweep"]

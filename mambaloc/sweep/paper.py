@@ -16,7 +16,7 @@ import yaml
 from mambaloc.benchmark.sizes import size_of
 from mambaloc.data.datasets.registry import DATASETS
 from mambaloc.models.base import mib
-from mambaloc.sweep.store import StoredCell
+from mambaloc.sweep.store import StoredTrial
 from mambaloc.sweep.summary import SEED, frame_counts
 
 _ALL = "all"
@@ -60,17 +60,17 @@ class PaperTable:
     measured: bool
 
 
-def paper_tables(cells: Iterable[StoredCell], epoch: str = "last") -> list[PaperTable]:
+def paper_tables(trials: Iterable[StoredTrial], epoch: str = "last") -> list[PaperTable]:
     """Lay out every table of the paper.
 
     Args:
-        cells: of a store; those that failed or lack the epoch are left out.
+        trials: of a store; those that failed or lack the epoch are left out.
         epoch: ``last`` or ``best``.
     """
-    by_basis: dict[Basis, list[StoredCell]] = {}
-    for cell in cells:
-        if cell.error is None and epoch in cell.results:
-            by_basis.setdefault(_basis_of(cell, epoch), []).append(cell)
+    by_basis: dict[Basis, list[StoredTrial]] = {}
+    for trial in trials:
+        if trial.error is None and epoch in trial.results:
+            by_basis.setdefault(_basis_of(trial, epoch), []).append(trial)
     return [_table(name, told, by_basis, epoch) for name, told in printed_tables().items()]
 
 
@@ -80,8 +80,8 @@ def printed_tables() -> dict[str, dict[str, Any]]:
     return yaml.safe_load(files("mambaloc.sweep").joinpath("paper.yaml").read_text(encoding="utf-8"))
 
 
-def _basis_of(cell: StoredCell, epoch: str) -> Basis:
-    result = cell.results[epoch]
+def _basis_of(trial: StoredTrial, epoch: str) -> Basis:
+    result = trial.results[epoch]
     data, told = result["data"], result["model"]["hyperparameters"]
     train, test = frame_counts(result)
     if data["official_split"]:
@@ -91,11 +91,11 @@ def _basis_of(cell: StoredCell, epoch: str) -> Basis:
     else:
         frames = f"{data['scene']} with a split of its own, {train} training and {test} test frames: not the benchmark"
     network = f"{told.get('backbone', 'GoogLeNet')} at {data['image_size'][0]}x{data['image_size'][1]} px"
-    others = tuple(f"{axis} {label}" for axis, label in cell.labels.items() if axis not in _PLACE)
+    others = tuple(f"{axis} {label}" for axis, label in trial.labels.items() if axis not in _PLACE)
     return Basis(data["dataset"], frames, network, others)
 
 
-def _table(name: str, told: dict[str, Any], by_basis: dict[Basis, list[StoredCell]], epoch: str) -> PaperTable:
+def _table(name: str, told: dict[str, Any], by_basis: dict[Basis, list[StoredTrial]], epoch: str) -> PaperTable:
     columns = told["columns"]
     sparsities = sorted({column.get("sparsity", "1") for column in columns} - {_ALL}, key=Fraction, reverse=True)
     lines, bases = [["Method", *(column["name"] for column in columns)]], dict[Basis, str]()
@@ -104,8 +104,8 @@ def _table(name: str, told: dict[str, Any], by_basis: dict[Basis, list[StoredCel
         specs = [{"sparsity": "1", **row, **column} for column in columns]
         sizes = [_size(spec) for spec in specs]
         ours = []
-        for basis, cells in by_basis.items():
-            measured = [_ours(spec, cells, basis, sparsities, epoch) for spec in specs]
+        for basis, trials in by_basis.items():
+            measured = [_ours(spec, trials, basis, sparsities, epoch) for spec in specs]
             if basis.dataset == told["dataset"] and any(measured):
                 letter = bases.setdefault(basis, ascii_lowercase[len(bases) % 26])
                 figures = [figure or size for figure, size in zip(measured, sizes, strict=True)]
@@ -119,15 +119,15 @@ def _table(name: str, told: dict[str, Any], by_basis: dict[Basis, list[StoredCel
     return PaperTable(name, told["title"], lines, notes + told["footnotes"], len(lines) > 1 + len(told["rows"]))
 
 
-def _ours(spec: dict[str, Any], cells: Sequence[StoredCell], basis: Basis, sparsities: list[str], epoch: str) -> str:
+def _ours(spec: dict[str, Any], trials: Sequence[StoredTrial], basis: Basis, sparsities: list[str], epoch: str) -> str:
     """Our figure for a place of a table, as text; nothing where a scene, a sparsity or all of it was not run."""
     what = spec.get("what", "error")
     if what not in _MEASURED:
         return ""
-    scenes = _scenes(spec["scene"], cells, basis, epoch)
+    scenes = _scenes(spec["scene"], trials, basis, epoch)
     wanted = [(scene, s) for scene in scenes for s in (sparsities if spec["sparsity"] == _ALL else [spec["sparsity"]])]
     for system in spec["systems"]:
-        told = [(cell.labels.get(SEED, ""), cell.results[epoch]) for cell in cells]
+        told = [(trial.labels.get(SEED, ""), trial.results[epoch]) for trial in trials]
         found = {
             (result["data"]["scene"], _sparsity(result), seed): result
             for seed, result in told
@@ -143,13 +143,13 @@ def _ours(spec: dict[str, Any], cells: Sequence[StoredCell], basis: Basis, spars
     return ""
 
 
-def _scenes(scene: str, cells: Sequence[StoredCell], basis: Basis, epoch: str) -> list[str]:
+def _scenes(scene: str, trials: Sequence[StoredTrial], basis: Basis, epoch: str) -> list[str]:
     """The scenes that a figure is over: an average of the benchmark's is over all of it, others over what there is."""
     if scene != _ALL:
         return [scene]
     if basis.frames == "official split":
         return list(DATASETS[basis.dataset].official_counts)
-    return list(dict.fromkeys(cell.results[epoch]["data"]["scene"] for cell in cells))
+    return list(dict.fromkeys(trial.results[epoch]["data"]["scene"] for trial in trials))
 
 
 def _is(result: dict[str, Any], system: str, gis: str, distilled: bool) -> bool:
@@ -174,9 +174,9 @@ def _size(spec: dict[str, Any]) -> str:
     return f"{mib(size_of(spec['systems'][0], spec['gis']).published):.2f}"
 
 
-def _describe(letter: str, basis: Basis, cells: Sequence[StoredCell], epoch: str) -> str:
-    results = [cell.results[epoch] for cell in cells]
-    seeds = ", ".join(sorted({cell.labels.get(SEED, "") for cell in cells}))
+def _describe(letter: str, basis: Basis, trials: Sequence[StoredTrial], epoch: str) -> str:
+    results = [trial.results[epoch] for trial in trials]
+    seeds = ", ".join(sorted({trial.labels.get(SEED, "") for trial in trials}))
     commits = ", ".join(sorted({str(result["training"]["commit"])[:7] for result in results}))
     devices = ", ".join(sorted({result["training"]["device"] for result in results}))
     rules = ", ".join(sorted({result["selection"].split(":")[0] for result in results}))

@@ -1,4 +1,4 @@
-"""What a matrix's results look like: a panel a system, a colour a label of what is compared."""
+"""What a sweep's results look like: a panel a system, a colour a label of what is compared."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
         text = "Median position errors against the number of training frames; dashed: retrieval among the same frames."
         figure = _panels(by_system, lambda axes, group: _by_frames(axes, group, series), "training frames", _ERROR)
         plots.append(Plot("Errors and training frames", text, figure))
-    if all(history(cell) for row in rows for cell in row.cells):
+    if all(history(trial) for row in rows for trial in row.trials):
         text = "Median position errors while training on the most frames, a line a seed; dashed: retrieval."
         figure = _panels(
             full, lambda axes, group: _by_time(axes, group, series), "training time (s)", _ERROR, sharex=False
@@ -53,7 +53,7 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
         plots.append(Plot("Errors and training time", text, figure))
     text = "Share of test frames whose position error is at most so large; trained on the most frames, all seeds."
     figure = _panels(full, lambda axes, group: _cumulative(axes, group, series), _ERROR, "share of frames")
-    told = (np.array(cell["frames"][_POSITION]) for group in full.values() for row in group for cell in row.cells)
+    told = (np.array(trial["frames"][_POSITION]) for group in full.values() for row in group for trial in row.trials)
     figure.axes[0].set(xlim=(0, most_shown(told)), ylim=(0, 1))
     return [*plots, Plot("Errors frame by frame", text, figure)]
 
@@ -116,8 +116,8 @@ def _by_frames(axes: Axes, group: list[Row], series: str | None) -> None:
 def _by_time(axes: Axes, group: list[Row], series: str | None) -> None:
     trainings: dict[str, list[tuple[list[float], list[float]]]] = {}
     for row in group:
-        for cell in row.cells:
-            curve = history(cell)
+        for trial in row.trials:
+            curve = history(trial)
             line = ([each["train_s"] for each in curve], [each[_POSITION] for each in curve])
             trainings.setdefault(_label(row, series), []).append(line)
     plot_errors_by_time(axes, trainings)
@@ -128,8 +128,8 @@ def _by_time(axes: Axes, group: list[Row], series: str | None) -> None:
 def _cumulative(axes: Axes, group: list[Row], series: str | None) -> None:
     errors: dict[str, list[float]] = {}
     for row in group:
-        for cell in row.cells:
-            errors.setdefault(_label(row, series), []).extend(cell["frames"][_POSITION])
+        for trial in row.trials:
+            errors.setdefault(_label(row, series), []).extend(trial["frames"][_POSITION])
     plot_cumulative(axes, {name: np.array(each) for name, each in errors.items()})
 
 

@@ -1,4 +1,4 @@
-"""What a running matrix shows: counts, what runs, what failed, and how long it may take."""
+"""What a running sweep shows: counts, what runs, what failed, and how long it may take."""
 
 from __future__ import annotations
 
@@ -14,53 +14,53 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from mambaloc.sweep.cells import Cell, Matrix
-from mambaloc.sweep.store import StoredCell
+from mambaloc.sweep.store import StoredTrial
+from mambaloc.sweep.trials import Sweep, Trial
 
 _FAILURES = 5  # shown at most
 
 
-def print_plan(matrix: Matrix, ended: Mapping[str, StoredCell]) -> None:
-    """Print a row a cell: its place, whether it ended, and the seconds it took, or cells of its system on average.
+def print_plan(sweep: Sweep, ended: Mapping[str, StoredTrial]) -> None:
+    """Print a row a trial: its place, whether it ended, and the seconds it took, or trials of its system on average.
 
     Args:
-        matrix: to run.
-        ended: cells that the store holds, by key.
+        sweep: to run.
+        ended: trials that the store holds, by key.
     """
-    first = next(iter(matrix.cells[0].labels))
+    first = next(iter(sweep.trials[0].labels))
     seconds: dict[str, list[float]] = {}
     for kept in ended.values():
         if kept.error is None:
             seconds.setdefault(kept.labels.get(first, ""), []).append(kept.seconds)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for axis in (*matrix.cells[0].labels, "state"):
+    for axis in (*sweep.trials[0].labels, "state"):
         table.add_column(axis)
     table.add_column("seconds", justify="right")
     due = 0.0
-    for cell in matrix.cells:
-        before, like = ended.get(cell.key), seconds.get(cell.labels[first])
+    for trial in sweep.trials:
+        before, like = ended.get(trial.key), seconds.get(trial.labels[first])
         expected = before.seconds if before else sum(like) / len(like) if like else None
         state = "to run" if before is None else "done" if before.error is None else f"failed: {before.error}"
         due += 0.0 if before or expected is None else expected
-        table.add_row(*cell.labels.values(), state, "" if expected is None else f"{expected:.0f}")
+        table.add_row(*trial.labels.values(), state, "" if expected is None else f"{expected:.0f}")
     console = Console(highlight=False)
     console.print(table)
     known = "" if not seconds else f", about {timedelta(seconds=int(due))} one after another, as far as is known"
-    console.print(f"{len(matrix.cells)} cells, {sum(c.key not in ended for c in matrix.cells)} to run{known}")
+    console.print(f"{len(sweep.trials)} trials, {sum(trial.key not in ended for trial in sweep.trials)} to run{known}")
 
 
-class MatrixProgress:
+class SweepProgress:
     """A live table on stderr; a context manager.
 
     Args:
-        matrix: that runs.
-        kept: its cells that had ended before.
+        sweep: that runs.
+        kept: its trials that had ended before.
     """
 
-    def __init__(self, matrix: Matrix, kept: Sequence[StoredCell]) -> None:
-        self._total = len(matrix.cells)
-        self._seconds = [cell.seconds for cell in kept if cell.error is None]
-        self._failures = [" ".join(cell.labels.values()) + f": {cell.error}" for cell in kept if cell.error]
+    def __init__(self, sweep: Sweep, kept: Sequence[StoredTrial]) -> None:
+        self._total = len(sweep.trials)
+        self._seconds = [trial.seconds for trial in kept if trial.error is None]
+        self._failures = [" ".join(trial.labels.values()) + f": {trial.error}" for trial in kept if trial.error]
         self._ended = len(kept)
         self._running: dict[str, tuple[str, float]] = {}
         self._console = Console(stderr=True)
@@ -75,22 +75,22 @@ class MatrixProgress:
     ) -> None:
         self._live.__exit__(kind, error, traceback)
 
-    def started(self, cell: Cell) -> None:
-        """A cell's turn came."""
-        self._running[cell.key] = (cell.name, time.monotonic())
+    def started(self, trial: Trial) -> None:
+        """A trial's turn came."""
+        self._running[trial.key] = (trial.name, time.monotonic())
 
-    def ended(self, cell: Cell, seconds: float, error: str | None) -> None:
-        """A cell is done, or failed."""
-        self._running.pop(cell.key, None)
+    def ended(self, trial: Trial, seconds: float, error: str | None) -> None:
+        """A trial is done, or failed."""
+        self._running.pop(trial.key, None)
         self._ended += 1
         if error is None:
             self._seconds.append(seconds)
         else:
-            self._failures.append(f"{cell.name}: {error}")
+            self._failures.append(f"{trial.name}: {error}")
             self._console.print(f"failed: {self._failures[-1]}", highlight=False, soft_wrap=True)
 
     def seconds_left(self) -> float | None:
-        """As the cells so far took on average, shared by those that run at once; None before the first ended."""
+        """As the trials so far took on average, shared by those that run at once; None before the first ended."""
         if not self._seconds:
             return None
         mean = sum(self._seconds) / len(self._seconds)
@@ -104,5 +104,5 @@ class MatrixProgress:
             table.add_row(name, str(timedelta(seconds=int(time.monotonic() - since))))
         left = self.seconds_left()
         soon = "" if left is None else f", about {timedelta(seconds=int(left))} left"
-        counts = f"{self._ended} of {self._total} cells ended, {len(self._failures)} of them failed{soon}"
+        counts = f"{self._ended} of {self._total} trials ended, {len(self._failures)} of them failed{soon}"
         return Group(Text(counts), table, *map(Text, self._failures[-_FAILURES:]))

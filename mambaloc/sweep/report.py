@@ -1,4 +1,4 @@
-"""A matrix's results as files that people read: one page, Markdown with its plots, and every table as CSV and LaTeX."""
+"""A sweep's results as files that people read: one page, Markdown with its plots, and every table as CSV and LaTeX."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mambaloc.files import whole_folder
 from mambaloc.sweep.formats import Section, as_csv, as_latex, as_markdown, as_page, as_svg
 from mambaloc.sweep.paper import paper_tables
 from mambaloc.sweep.plots import NAMES, plots_of
-from mambaloc.sweep.store import Store, StoredCell
+from mambaloc.sweep.store import Store, StoredTrial
 from mambaloc.sweep.summary import ERRORS, Difference, Figure, Row, differences, history, rows_of
 
 Table = list[list[str]]
@@ -24,7 +24,7 @@ def write_report(
     comparisons: Sequence[tuple[str, str, str]] = (),
     epoch: str = "last",
     reach_m: float | None = None,
-) -> tuple[list[Row], list[StoredCell]]:
+) -> tuple[list[Row], list[StoredTrial]]:
     """Write ``report.html``, ``report.md`` with ``plots/``, and ``tables/``: results, differences, the paper's tables.
 
     Args:
@@ -36,27 +36,27 @@ def write_report(
         reach_m: position error whose training seconds are told; retrieval's, where that was measured, unless given.
 
     Returns:
-        The rows, and the cells that failed.
+        The rows, and the trials that failed.
 
     Raises:
-        InputError: where no cell has ended, a comparison's label is none, or the folder cannot be written.
+        InputError: where no trial has ended, a comparison's label is none, or the folder cannot be written.
     """
-    cells = list(Store.ended(store).values())
-    rows, failed = rows_of(cells, epoch), [cell for cell in cells if cell.error is not None]
+    trials = list(Store.ended(store).values())
+    rows, failed = rows_of(trials, epoch), [trial for trial in trials if trial.error is not None]
     if not rows:
-        raise InputError(f"{store}: holds no result of the {epoch} epoch; run a matrix into it first")
+        raise InputError(f"{store}: holds no result of the {epoch} epoch; run a sweep into it first")
     if out.exists():
         raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
     sections = [_results(rows)]
     for number, (axis, before, after) in enumerate(comparisons):
-        found = differences(cells, axis, before, after, epoch)
+        found = differences(trials, axis, before, after, epoch)
         sections.append(_compared(f"difference_{number + 1}", axis, before, after, found))
     plots = plots_of(rows, comparisons[0][0] if comparisons else None)
     sections += [Section("", plot.title, plot.text, plot=as_svg(plot.figure)) for plot in plots]
     sections += [_times(rows, reach_m), _references(rows)]
     sections += [
         Section(each.name, f"The paper's table: {each.title}", "", each.lines, each.footnotes, folded=not each.measured)
-        for each in paper_tables(cells, epoch)
+        for each in paper_tables(trials, epoch)
     ]
     if failed:
         sections.append(_failures(failed))
@@ -78,11 +78,11 @@ def _write(folder: Path, introduction: str, sections: Sequence[Section]) -> None
     (folder / "report.html").write_text(as_page(introduction, sections), encoding="utf-8")
 
 
-def _introduction(rows: Sequence[Row], failed: Sequence[StoredCell]) -> str:
-    runs = sum(len(row.cells) for row in rows)
-    cells = [cell for row in rows for cell in row.cells]
-    commits = ", ".join(sorted({str(cell["training"]["commit"])[:7] for cell in cells}))
-    devices = ", ".join(sorted({cell["training"]["device"] for cell in cells}))
+def _introduction(rows: Sequence[Row], failed: Sequence[StoredTrial]) -> str:
+    runs = sum(len(row.trials) for row in rows)
+    trials = [trial for row in rows for trial in row.trials]
+    commits = ", ".join(sorted({str(trial["training"]["commit"])[:7] for trial in trials}))
+    devices = ", ".join(sorted({trial["training"]["device"] for trial in trials}))
     failures = f", {len(failed)} more failed" if failed else ""
     data = "; ".join(dict.fromkeys(row.data for row in rows))
     return f"{runs} trainings{failures}; commit {commits}; {devices}. Data: {data}."
@@ -143,12 +143,12 @@ def _reached(row: Row, reach_m: float | None) -> str:
     retrieval = row.references.get("retrieval")
     if reach_m is None and retrieval is not None:
         reach_m = retrieval["position_error_m"]
-    if reach_m is None or not all(map(history, row.cells)):
+    if reach_m is None or not all(map(history, row.trials)):
         return ""
     told = [seconds for seconds in row.reached_s(reach_m) if seconds is not None]
     if not told:
         return "never"
-    return _spread(told, 1) + ("" if len(told) == len(row.cells) else f" ({len(told)} of {len(row.cells)} seeds)")
+    return _spread(told, 1) + ("" if len(told) == len(row.trials) else f" ({len(told)} of {len(row.trials)} seeds)")
 
 
 def _references(rows: Sequence[Row]) -> Section:
@@ -163,9 +163,9 @@ def _references(rows: Sequence[Row]) -> Section:
     return Section("references", "References", text, [header, *map(list, found)] if found else None)
 
 
-def _failures(failed: Sequence[StoredCell]) -> Section:
+def _failures(failed: Sequence[StoredTrial]) -> Section:
     header = [*failed[0].labels, "error"]
-    return Section("failed", "Failed", "", [header, *([*cell.labels.values(), str(cell.error)] for cell in failed)])
+    return Section("failed", "Failed", "", [header, *([*trial.labels.values(), str(trial.error)] for trial in failed)])
 
 
 def _signed(figure: Figure) -> str:

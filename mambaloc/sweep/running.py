@@ -1,4 +1,4 @@
-"""Run the cells of a matrix, each in its own process: one after another, or side by side on Ray."""
+"""Run the trials of a sweep, each in its own process: one after another, or side by side on Ray."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from mambaloc.errors import InputError
-from mambaloc.sweep.cells import Cell, Matrix
-from mambaloc.sweep.progress import MatrixProgress
+from mambaloc.sweep.progress import SweepProgress
 from mambaloc.sweep.store import Store
+from mambaloc.sweep.trials import Sweep, Trial
 
 TRAIN = (sys.executable, "-m", "mambaloc.cli")
 _SUPERVISOR = Path(__file__).with_name("supervised.py")
@@ -33,7 +33,7 @@ _SUPERVISOR = Path(__file__).with_name("supervised.py")
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a cell's process ended.
+    """How a trial's process ended.
 
     Args:
         results: what each evaluation says, by epoch: ``metrics.json``, and ``frames``.
@@ -46,53 +46,53 @@ class Outcome:
     error: str | None = None
 
 
-def run_matrix(matrix: Matrix, out: Path, address: str | None = None, retry_failed: bool = False) -> dict[str, int]:
-    """Run every cell that the store does not hold; the store learns of each as it ends.
+def run_sweep(sweep: Sweep, out: Path, address: str | None = None, retry_failed: bool = False) -> dict[str, int]:
+    """Run every trial that the store does not hold; the store learns of each as it ends.
 
     Args:
-        matrix: what to run.
+        sweep: what to run.
         out: folder of the store, and of ``runs/``; on a cluster, one that every machine sees.
-        address: of a Ray cluster; without it a local Ray, or one cell after another where Ray is not installed.
+        address: of a Ray cluster; without it a local Ray, or one trial after another where Ray is not installed.
         retry_failed: also those that failed before.
 
     Returns:
-        How many cells are ``done``, ``failed``, and were ``found`` in the store.
+        How many trials are ``done``, ``failed``, and were ``found`` in the store.
 
     Raises:
-        InputError: where another process runs cells into the same folder, it cannot be written, or Ray is not there.
+        InputError: where another process runs trials into the same folder, it cannot be written, or Ray is not there.
     """
-    with Store(out) as store, _alone(out), _pool(matrix, address) as submit:
+    with Store(out) as store, _alone(out), _pool(sweep, address) as submit:
         ended = store.read()
-        found = [ended[cell.key] for cell in matrix.cells if cell.key in ended]  # it may hold another matrix's too
-        kept = [cell for cell in found if cell.error is None or not retry_failed]
-        failed = {cell.key for cell in kept if cell.error is not None}
-        done = {cell.key for cell in kept} - failed
-        waiting = [cell for cell in matrix.cells if cell.key not in done | failed]
-        with MatrixProgress(matrix, kept) as progress:
-            running: dict[Future[Outcome], Cell] = {}
+        found = [ended[trial.key] for trial in sweep.trials if trial.key in ended]  # it may hold another sweep's too
+        kept = [trial for trial in found if trial.error is None or not retry_failed]
+        failed = {trial.key for trial in kept if trial.error is not None}
+        done = {trial.key for trial in kept} - failed
+        waiting = [trial for trial in sweep.trials if trial.key not in done | failed]
+        with SweepProgress(sweep, kept) as progress:
+            running: dict[Future[Outcome], Trial] = {}
             while waiting or running:
-                for cell in [cell for cell in waiting if set(cell.after) <= done | failed]:
-                    waiting.remove(cell)
-                    if lost := failed & set(cell.after):
-                        outcome = Outcome({}, 0.0, f"needs the run of a cell that failed ({min(lost)[:12]})")
-                        _keep(store, progress, cell, outcome, done, failed)
+                for trial in [trial for trial in waiting if set(trial.after) <= done | failed]:
+                    waiting.remove(trial)
+                    if lost := failed & set(trial.after):
+                        outcome = Outcome({}, 0.0, f"needs the run of a trial that failed ({min(lost)[:12]})")
+                        _keep(store, progress, trial, outcome, done, failed)
                         continue
-                    folder = run_folder(out, cell.key).absolute()
-                    words = cell.command(partial(run_folder, out.absolute()))
-                    command = (*TRAIN, *words, "--trainer.default_root_dir", str(folder))
-                    running[submit(command, folder, matrix.time_limit_s, matrix.cpus)] = cell
-                    progress.started(cell)
+                    folder = run_folder(out, trial.key).absolute()
+                    args = trial.command(partial(run_folder, out.absolute()))
+                    command = (*TRAIN, *args, "--trainer.default_root_dir", str(folder))
+                    running[submit(command, folder, sweep.time_limit_s, sweep.cpus)] = trial
+                    progress.started(trial)
                 for future in wait(running, return_when=FIRST_COMPLETED).done if running else ():
                     _keep(store, progress, running.pop(future), _outcome(future), done, failed)
     return {"done": len(done), "failed": len(failed), "found": len(kept)}
 
 
 def run_folder(out: Path, key: str) -> Path:
-    """Where a cell's training writes."""
+    """Where a trial's training writes."""
     return out / "runs" / key[:12]
 
 
-def run_cell(command: tuple[str, ...], run: Path, time_limit_s: float, cpus: float) -> Outcome:
+def run_trial(command: tuple[str, ...], run: Path, time_limit_s: float, cpus: float) -> Outcome:
     """Train and evaluate in a process of its own; needs nothing of the caller's but its arguments.
 
     Args:
@@ -160,11 +160,11 @@ def _outcome(future: Future[Outcome]) -> Outcome:
 
 
 def _keep(
-    store: Store, progress: MatrixProgress, cell: Cell, outcome: Outcome, done: set[str], failed: set[str]
+    store: Store, progress: SweepProgress, trial: Trial, outcome: Outcome, done: set[str], failed: set[str]
 ) -> None:
-    store.write(cell, outcome.results, outcome.seconds, outcome.error)
-    (done if outcome.error is None else failed).add(cell.key)
-    progress.ended(cell, outcome.seconds, outcome.error)
+    store.write(trial, outcome.results, outcome.seconds, outcome.error)
+    (done if outcome.error is None else failed).add(trial.key)
+    progress.ended(trial, outcome.seconds, outcome.error)
 
 
 @contextlib.contextmanager
@@ -173,7 +173,7 @@ def _alone(out: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        raise InputError(f"{out}: another process runs cells into it; wait for it, or choose another --out") from None
+        raise InputError(f"{out}: another process runs trials into it; wait for it, or choose another --out") from None
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
     try:
@@ -186,13 +186,13 @@ Submit = Callable[[tuple[str, ...], Path, float, float], "Future[Outcome]"]
 
 
 @contextlib.contextmanager
-def _pool(matrix: Matrix, address: str | None) -> Iterator[Submit]:
-    """What runs cells: Ray where it is installed, else a thread that runs one at a time."""
+def _pool(sweep: Sweep, address: str | None) -> Iterator[Submit]:
+    """What runs trials: Ray where it is installed, else a thread that runs one at a time."""
     if find_spec("ray") is None:
         if address is not None:
             raise InputError(f"--address {address}: needs Ray; pip install 'mambaloc[cluster]'")
         with ThreadPoolExecutor(1) as pool:
-            yield lambda *arguments: pool.submit(run_cell, *arguments)
+            yield lambda *arguments: pool.submit(run_trial, *arguments)
         return
     import ray
 
@@ -201,11 +201,11 @@ def _pool(matrix: Matrix, address: str | None) -> Iterator[Submit]:
         ray.init(address=address, log_to_driver=False, include_dashboard=False, configure_logging=False)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise InputError(f"--address {address}: no Ray there ({str(error).splitlines()[0]}); start one") from None
-    for name, needed in (("CPU", matrix.cpus), ("GPU", matrix.gpus)):
+    for name, needed in (("CPU", sweep.cpus), ("GPU", sweep.gpus)):
         if (there := ray.cluster_resources().get(name, 0)) < needed:
             ray.shutdown()
-            raise InputError(f"{name.lower()}s: {needed:g} a cell, and Ray has {there:g}; lower it in the matrix")
-    remote = ray.remote(num_cpus=matrix.cpus, num_gpus=matrix.gpus, max_retries=0)(run_cell)
+            raise InputError(f"{name.lower()}s: {needed:g} a trial, and Ray has {there:g}; lower it in the sweep")
+    remote = ray.remote(num_cpus=sweep.cpus, num_gpus=sweep.gpus, max_retries=0)(run_trial)
     try:
         yield lambda *arguments: remote.remote(*arguments).future()
     finally:

@@ -1,4 +1,4 @@
-"""Where results are kept: one SQLite file, to which a finished cell is written in one transaction."""
+"""Where results are kept: one SQLite file, to which a finished trial is written in one transaction."""
 
 from __future__ import annotations
 
@@ -13,30 +13,36 @@ from types import TracebackType
 from typing import Any, Self
 
 from mambaloc.errors import InputError
-from mambaloc.sweep.cells import Cell
+from mambaloc.sweep.trials import Trial
 
 STORE_FILE = "results.sqlite"
 _TABLE = """
-CREATE TABLE IF NOT EXISTS cells (
+CREATE TABLE IF NOT EXISTS trials (
     key TEXT PRIMARY KEY,
     labels TEXT NOT NULL,
-    words TEXT NOT NULL,
+    args TEXT NOT NULL,
     error TEXT,
     results TEXT NOT NULL,
     seconds REAL NOT NULL,
     ended TEXT NOT NULL
 )
 """
+_RENAME = """
+BEGIN IMMEDIATE;
+ALTER TABLE cells RENAME TO trials;
+ALTER TABLE trials RENAME COLUMN words TO args;
+COMMIT;
+"""  # of a store written when trials were called cells, and their arguments words
 
 
 @dataclass(frozen=True)
-class StoredCell:
-    """A cell that ended.
+class StoredTrial:
+    """A trial that ended.
 
     Args:
-        key: of the cell.
+        key: of the trial.
         labels: its place on each axis.
-        words: of the command.
+        args: of the command.
         error: why it failed; None where it did not.
         results: what each evaluation says, by epoch (``best``, ``last``): ``metrics.json``, and each frame's errors.
         seconds: from its process's start to its end.
@@ -45,7 +51,7 @@ class StoredCell:
 
     key: str
     labels: dict[str, str]
-    words: list[str]
+    args: list[str]
     error: str | None
     results: dict[str, dict[str, Any]]
     seconds: float
@@ -53,7 +59,7 @@ class StoredCell:
 
 
 class Store:
-    """The results of a matrix in a folder; a context manager.
+    """The results of a sweep in a folder; a context manager.
 
     Args:
         folder: holds ``results.sqlite``, and is made where there is none.
@@ -67,6 +73,8 @@ class Store:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._database = sqlite3.connect(self.path)
+            if self._database.execute("SELECT 1 FROM sqlite_master WHERE name = 'cells'").fetchone():
+                self._database.executescript(_RENAME)
             with self._database:
                 self._database.execute(_TABLE)
         except OSError as error:
@@ -77,7 +85,7 @@ class Store:
             raise InputError(f"{self.path}: is no store of results ({error}); choose another --out") from None
 
     @classmethod
-    def ended(cls, folder: Path) -> dict[str, StoredCell]:
+    def ended(cls, folder: Path) -> dict[str, StoredTrial]:
         """What :meth:`read` says of a folder's store; nothing where there is none, which is not made."""
         if not (folder / STORE_FILE).is_file():
             return {}
@@ -92,38 +100,38 @@ class Store:
     ) -> None:
         self._database.close()
 
-    def write(self, cell: Cell, results: dict[str, dict[str, Any]], seconds: float, error: str | None = None) -> None:
-        """Keep how a cell ended; what was kept of an earlier try is replaced.
+    def write(self, trial: Trial, results: dict[str, dict[str, Any]], seconds: float, error: str | None = None) -> None:
+        """Keep how a trial ended; what was kept of an earlier try is replaced.
 
         Raises:
             InputError: where it cannot be written; what it held, it holds.
         """
         ended = datetime.now(UTC).isoformat(timespec="seconds")
         row = (
-            cell.key,
-            json.dumps(dict(cell.labels)),
-            json.dumps(cell.words),
+            trial.key,
+            json.dumps(dict(trial.labels)),
+            json.dumps(trial.args),
             error,
             json.dumps(results),
             seconds,
             ended,
         )
-        with self._told("free some space, and run the matrix again"), self._database:
-            self._database.execute("INSERT OR REPLACE INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        with self._told("free some space, and run the sweep again"), self._database:
+            self._database.execute("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?)", row)
 
-    def read(self) -> dict[str, StoredCell]:
-        """Every cell that ended, by key, in the order they did.
+    def read(self) -> dict[str, StoredTrial]:
+        """Every trial that ended, by key, in the order they did.
 
         Raises:
             InputError: where the file is damaged.
         """
         with self._told("put a copy in its place, or choose another --out"):
             rows = self._database.execute(
-                "SELECT key, labels, words, error, results, seconds, ended FROM cells ORDER BY rowid"
+                "SELECT key, labels, args, error, results, seconds, ended FROM trials ORDER BY rowid"
             ).fetchall()
             return {
-                key: StoredCell(key, json.loads(labels), json.loads(words), error, json.loads(results), seconds, ended)
-                for key, labels, words, error, results, seconds, ended in rows
+                key: StoredTrial(key, json.loads(labels), json.loads(args), error, json.loads(results), seconds, ended)
+                for key, labels, args, error, results, seconds, ended in rows
             }
 
     @contextmanager

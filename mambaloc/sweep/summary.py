@@ -1,4 +1,4 @@
-"""What a matrix's results come to: a row a place on the axes over its seeds, and differences on the same frames."""
+"""What a sweep's results come to: a row a place on the axes over its seeds, and differences on the same frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import LEVEL, block_resamples
-from mambaloc.sweep.store import StoredCell
+from mambaloc.sweep.store import StoredTrial
 
 SEED = "seed"
 """The axis that rows are means over."""
@@ -58,7 +58,7 @@ class Row:
         data: dataset and scene, and whether they are the benchmark's own split.
         selection: how the epoch was chosen.
         references: medians of answers that need no training, by name.
-        cells: the results themselves, a seed each.
+        trials: the results themselves, a seed each.
     """
 
     labels: dict[str, str]
@@ -71,7 +71,7 @@ class Row:
     data: str
     selection: str
     references: dict[str, dict[str, float]]
-    cells: tuple[dict[str, Any], ...]
+    trials: tuple[dict[str, Any], ...]
 
     @property
     def beats_retrieval(self) -> bool | None:
@@ -81,7 +81,7 @@ class Row:
 
     def reached_s(self, error_m: float) -> tuple[float | None, ...]:
         """Training seconds to a median position error, a seed each; None where it never got there."""
-        return tuple(reached_s(cell, error_m) for cell in self.cells)
+        return tuple(reached_s(trial, error_m) for trial in self.trials)
 
 
 @dataclass(frozen=True)
@@ -101,23 +101,23 @@ class Difference:
     reach_ratio: tuple[float, ...]
 
 
-def rows_of(cells: Iterable[StoredCell], epoch: str = "last") -> list[Row]:
-    """Put the cells of each place together; those that failed, or lack the epoch, are left out.
+def rows_of(trials: Iterable[StoredTrial], epoch: str = "last") -> list[Row]:
+    """Put the trials of each place together; those that failed, or lack the epoch, are left out.
 
     Args:
-        cells: of a store.
+        trials: of a store.
         epoch: ``last`` or ``best``.
     """
-    return [_row(labels, group, epoch) for labels, group in _places(cells, epoch, (SEED,))]
+    return [_row(labels, group, epoch) for labels, group in _places(trials, epoch, (SEED,))]
 
 
 def differences(
-    cells: Iterable[StoredCell], axis: str, before: str, after: str, epoch: str = "last"
+    trials: Iterable[StoredTrial], axis: str, before: str, after: str, epoch: str = "last"
 ) -> list[Difference]:
     """Compare two labels of an axis wherever both were run, seed by seed; then over all of the first axis.
 
     Args:
-        cells: of a store.
+        trials: of a store.
         axis: that differs.
         before: its label that is compared with.
         after: the other.
@@ -126,13 +126,13 @@ def differences(
     Raises:
         InputError: where the axis has no such label.
     """
-    cells = list(cells)
+    trials = list(trials)
     for label in (before, after):
-        if not any(cell.labels.get(axis) == label for cell in cells):
-            raise InputError(f"--compare {axis}: no cell that ended has {label} there")
+        if not any(trial.labels.get(axis) == label for trial in trials):
+            raise InputError(f"--compare {axis}: no trial that ended has {label} there")
     found = []
     together: dict[tuple[tuple[str, str], ...], list[Pair]] = {}
-    for labels, group in _places(cells, epoch, (SEED, axis)):
+    for labels, group in _places(trials, epoch, (SEED, axis)):
         if pairs := _pairs(group, axis, before, after, epoch):
             found.append(_difference(labels, pairs))
             (first, _), *others = labels.items()
@@ -172,35 +172,35 @@ def frame_counts(result: dict[str, Any]) -> tuple[int, int]:
 Pair = tuple[dict[str, Any], dict[str, Any]]
 
 
-def _pairs(group: list[StoredCell], axis: str, before: str, after: str, epoch: str) -> list[Pair]:
+def _pairs(group: list[StoredTrial], axis: str, before: str, after: str, epoch: str) -> list[Pair]:
     by_seed: dict[str, dict[str, dict[str, Any]]] = {}
-    for cell in group:
-        by_seed.setdefault(cell.labels.get(SEED, ""), {})[cell.labels[axis]] = cell.results[epoch]
+    for trial in group:
+        by_seed.setdefault(trial.labels.get(SEED, ""), {})[trial.labels[axis]] = trial.results[epoch]
     return [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
 
 
 def _places(
-    cells: Iterable[StoredCell], epoch: str, without: Sequence[str]
-) -> list[tuple[dict[str, str], list[StoredCell]]]:
-    places: dict[tuple[tuple[str, str], ...], list[StoredCell]] = {}
-    for cell in cells:
-        if cell.error is None and epoch in cell.results:
-            place = tuple((axis, label) for axis, label in cell.labels.items() if axis not in without)
-            places.setdefault(place, []).append(cell)
-    order: dict[str, list[str]] = {}  # of labels as they come: cells that end side by side end in any order
+    trials: Iterable[StoredTrial], epoch: str, without: Sequence[str]
+) -> list[tuple[dict[str, str], list[StoredTrial]]]:
+    places: dict[tuple[tuple[str, str], ...], list[StoredTrial]] = {}
+    for trial in trials:
+        if trial.error is None and epoch in trial.results:
+            place = tuple((axis, label) for axis, label in trial.labels.items() if axis not in without)
+            places.setdefault(place, []).append(trial)
+    order: dict[str, list[str]] = {}  # of labels as they come: trials that end side by side end in any order
     for axis, label in itertools.chain.from_iterable(places):
         order.setdefault(axis, []).append(label)
     ranks = sorted(places, key=lambda place: [order[axis].index(label) for axis, label in place])
     return [(dict(place), places[place]) for place in ranks]
 
 
-def _row(labels: dict[str, str], group: list[StoredCell], epoch: str) -> Row:
-    group = sorted(group, key=lambda cell: cell.labels.get(SEED, ""))
-    results = [cell.results[epoch] for cell in group]
+def _row(labels: dict[str, str], group: list[StoredTrial], epoch: str) -> Row:
+    group = sorted(group, key=lambda trial: trial.labels.get(SEED, ""))
+    results = [trial.results[epoch] for trial in group]
     first, rows = results[0], _resamples(results[0])
     return Row(
         labels=labels,
-        seeds=tuple(cell.labels.get(SEED, "") for cell in group),
+        seeds=tuple(trial.labels.get(SEED, "") for trial in group),
         errors={name: _figure([_medians(result, name, rows) for result in results]) for name in ERRORS},
         train_s=tuple(result["training"]["wall_clock"]["train_s"] for result in results),
         steps=tuple(result["training"]["step"] for result in results),
@@ -209,7 +209,7 @@ def _row(labels: dict[str, str], group: list[StoredCell], epoch: str) -> Row:
         data=data_label(first),
         selection=first["selection"],
         references=first["references"],
-        cells=tuple(results),
+        trials=tuple(results),
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from safetensors.torch import save
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.download.origins import licence_of_weights
+from mambaloc.data.datasets.registry import licence_of_weights
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint
 from mambaloc.evaluation.evaluate import data_of, localise_test_frames

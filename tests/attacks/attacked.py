@@ -17,7 +17,7 @@ from mambaloc.console import exits_cleanly, quieten
 
 SERVER = multiprocessing.get_context("forkserver")
 # Not the subjects themselves: before Python 3.12.8 the server knows nothing of pytest's paths, and does not say so.
-SERVER.set_forkserver_preload(["mambaloc.cli", "mambaloc.importing.importer", "mambaloc.sweep", "mambaloc.zoo"])
+SERVER.set_forkserver_preload(["mambaloc.cli", "mambaloc.importing.importer", "mambaloc.sweep.report", "mambaloc.zoo"])
 
 
 def audited(below: Path, deed) -> None:

@@ -24,7 +24,8 @@ from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.trajectory import write_tum
-from mambaloc.sweep import Store, read_matrix, run_matrix, running, write_report
+from mambaloc.sweep import Store, read_sweep, run_sweep, running
+from mambaloc.sweep.report import write_report
 from mambaloc.zoo import load
 from mambaloc.zoo.publishing import publish
 
@@ -153,7 +154,7 @@ def benchmark(inputs, out):
     copy = f"import shutil, sys; shutil.copytree({str(inputs / 'run/evaluation')!r}, sys.argv[-1] + '/evaluation')"
     running.TRAIN, running.find_spec = (sys.executable, "-c", copy), lambda name: None  # one after another
     kept = {key: cell for key, cell in Store.ended(out / "results").items() if cell.error is None}
-    run_matrix(read_matrix(inputs / "matrix.yaml"), out / "results", retry_failed=True)
+    run_sweep(read_sweep(inputs / "matrix.yaml"), out / "results", retry_failed=True)
     assert kept.items() <= Store.ended(out / "results").items()  # the cells that had ended are not run again
     if not (out / "report").exists():
         write_report(out / "results", out / "report")

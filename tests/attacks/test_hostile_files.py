@@ -30,7 +30,7 @@ from mambaloc.rendering import read_pose_table, shots_of_sequences, write_cambri
 from mambaloc.rendering.trajectories import smooth_trajectory
 from mambaloc.runtime import Contract, Localiser
 from mambaloc.runtime.bundle import verify_bundle
-from mambaloc.sweep import Cell, Store, read_matrix
+from mambaloc.sweep import Store, Trial, read_sweep
 from mambaloc.zoo.loading import load_released
 from mambaloc.zoo.manifest import Manifest
 
@@ -194,7 +194,7 @@ def test_transforms(captured, fed):
 def test_stores(tmp_path, fed):
     with Store(tmp_path) as store:
         for number in range(3):
-            cell = Cell({"system": "a", "seed": str(number)}, ("recipe.yaml",), str(number) * 64)
+            cell = Trial({"system": "a", "seed": str(number)}, ("recipe.yaml",), str(number) * 64)
             store.write(cell, {"last": {"metrics": {"position_error_m": 0.5}}}, 1.0)
     fed("store of results", lambda path: Store.ended(path.parent), tmp_path / "results.sqlite")
 
@@ -228,7 +228,7 @@ LABEL = "seq1/frame00001.png 1 2 3 1 0 0 0"
         ("overlay.yaml", lambda folder, *_: Setting("mambaloc").with_overlay(folder / "overlay.yaml"), LAUGHS),
         ("recipe.yaml", lambda folder, *_: recipe_arguments([str(folder / "recipe.yaml")]), LAUGHS),
         ("recipe.yaml", lambda folder, *_: recipe_arguments([str(folder / "recipe.yaml")]), "model: &a [*a]"),
-        ("matrix.yaml", lambda folder, *_: read_matrix(folder / "matrix.yaml"), "a: {" * 10**5),
+        ("matrix.yaml", lambda folder, *_: read_sweep(folder / "matrix.yaml"), "a: {" * 10**5),
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 20 else None,
 )
@@ -262,7 +262,7 @@ def test_overlays(tmp_path, fed):
 
 def test_matrices(tmp_path, fed):
     matrix = shutil.copy(REPOSITORY / "recipes/sweeps/redkitchen_blocks.yaml", tmp_path)
-    fed("matrix", read_matrix, Path(matrix))
+    fed("matrix", read_sweep, Path(matrix))
 
 
 def test_manifests(tmp_path, fed):

@@ -1,26 +1,32 @@
 """Speed: the reference computes what we do, every figure is measured, and the arithmetic is right."""
 
 import json
+import os
 import time
+from dataclasses import replace
 
 import pytest
 import torch
 from rich.console import Console
 
-from mambaloc import benchmark
-from mambaloc.benchmark import Setting, measure_all, print_report, write_report
-from mambaloc.benchmark.floors import Floors, measure_floors
-from mambaloc.benchmark.footprint import Footprint, exponent, peak_bytes
+from mambaloc.benchmark import Setting, footprint, measure_all, print_report, whole_training, write_report
+from mambaloc.benchmark.footprint import (
+    Footprint,
+    exponent,
+    in_a_process,
+    measure_footprints,
+    measure_scaling,
+    peak_bytes,
+)
 from mambaloc.benchmark.reference import DecodedFrames, Published, ReferenceLoop
-from mambaloc.benchmark.savings import SAVINGS, gis_together
 from mambaloc.benchmark.speed import LOOP_ALONE, OURS, PARTS, REFERENCE, measure_speed, ratio
-from mambaloc.benchmark.speed_report import print_scaling, print_whole_training
+from mambaloc.benchmark.speed_report import print_scaling
 from mambaloc.benchmark.whole_training import measure_whole_training
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.models import create_model
-from mambaloc.nn import GlobalInformationSelector
 
+TINY_BACKBONE = "test_efficientnet"  # timm's own for tests
 SMALL = {"dim": 32, "heads": 4, "encoder_layers": 2, "feedforward": 32, "head_hidden": 32}
 
 
@@ -31,20 +37,18 @@ def data(scenes):
     return module
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def setting(scenes):
     scene = {"dataset": "7scenes", "root": str(scenes), "image_size": 32, "short_side": 36, "batch_size": 4}
-    return Setting("mambaloc", {"backbone": "resnet10t", **SMALL}, {**scene, "validation": "sequences"})
+    return Setting("mambaloc", {"backbone": TINY_BACKBONE, **SMALL}, {**scene, "validation": "sequences"})
 
 
 @pytest.mark.parametrize("backbone", ["resnet10t", "mobilenetv3_small_050"])
 @pytest.mark.parametrize("gis", ["none", "gis"])
-@pytest.mark.parametrize("extra", [*SAVINGS, "all"])
-def test_published_form_is_the_same_function(backbone, gis, extra):
+def test_published_form_is_the_same_function(backbone, gis):
     torch.manual_seed(0)
     system = create_model("mambaloc", backbone=backbone, gis=gis, image_size=64, **SMALL).eval()
-    work = {} if extra == "all" else {**dict.fromkeys(SAVINGS, False), extra: True}
-    published = Published(system, **work).eval()
+    published = Published(system).eval()
     image = torch.rand(2, 3, 64, 64)
     ours, theirs = system(image), published(system.network.backbone.normalised(image))
     torch.testing.assert_close(theirs.position_m, ours.position_m, rtol=1e-5, atol=1e-6)
@@ -78,7 +82,7 @@ def test_reference_decodes_what_the_cache_holds(data):
 
 def test_reference_learns(data):
     torch.manual_seed(0)
-    system = create_model("mambaloc", backbone="resnet10t", image_size=32, lr=1e-3, **SMALL)
+    system = create_model("mambaloc", backbone=TINY_BACKBONE, image_size=32, lr=1e-3, **SMALL)
     loop = ReferenceLoop(system, data, Published(system), 12, torch.device("cpu"), 0)
     losses = [loss for _ in range(4) for loss in loop.train()]
     assert len(losses) == 48
@@ -86,27 +90,10 @@ def test_reference_learns(data):
     assert loop.evaluate(loop.loader("val", 1, 5)) == 5
 
 
-def test_two_gis_as_one_are_the_two():
-    torch.manual_seed(0)
-    blocks = [GlobalInformationSelector(32) for _ in range(2)]
-    feats = [torch.rand(3, 32, requires_grad=True) for _ in range(2)]
-    apart = [block(feat) for block, feat in zip(blocks, feats, strict=True)]
-    together = gis_together(*blocks, *feats)
-    wanted = torch.autograd.grad(sum(out.square().sum() for out in apart), [*feats, *blocks[1].parameters()])
-    found = torch.autograd.grad(sum(out.square().sum() for out in together), [*feats, *blocks[1].parameters()])
-    for one, other in zip([*apart, *wanted], [*together, *found], strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
-
-
 def test_ratios_by_hand():
     times, spread = ratio([2.0, 4.0, 6.0, 8.0], [1.0, 2.0, 3.0, 2.0])
     assert times == 5 / 2
     assert spread == pytest.approx(1.5)  # of 2, 2, 2 and 4: quartiles 2 and 3.5
-
-
-def test_floors_by_hand():
-    floors = Floors(0.1, flops=10**10, bytes=10**9, flops_per_s=4e11, bytes_per_s=5e10, kernels=[])
-    assert (floors.of_operations, floors.of_bytes) == pytest.approx((0.25, 0.2))
 
 
 def test_exponents_by_hand(capsys):
@@ -133,7 +120,7 @@ def test_overlays_say_model_data_and_trainer(tmp_path):
     setting = Setting("mambaloc", {"dim": 4, "heads": 2}, {"short_side": 9}).with_overlay(overlay)
     assert setting.model == {"dim": 8, "heads": 2}
     assert setting.data == {"short_side": 9, "batch_size": 2}
-    assert setting.is_half
+    assert setting.trainer == {"precision": "bf16-mixed"}
     assert setting.device.type == "cpu"
 
 
@@ -159,21 +146,30 @@ def test_speed_needs_frames(setting):
         measure_speed(setting, batches=[8], steps=4)
 
 
-def test_floors_count_operations_and_bytes(setting):
-    few, many = (measure_floors(setting, batch, 4) for batch in (2, 4))
-    assert many.flops == pytest.approx(2 * few.flops, rel=0.01)
-    weights = create_model("mambaloc", image_size=32, **setting.model)
-    parameters = sum(p.numel() for p in weights.parameters())
-    kept = [floors.bytes - 40 * parameters for floors in (few, many)]  # 3 x 4 by the passes, 7 x 4 by Adam
-    assert kept[1] == pytest.approx(2 * kept[0], rel=0.05)
-    assert sum(share for _, share in few.kernels) <= 1
+@pytest.fixture(scope="module")
+def measured(setting):
+    """Everything, measured in this process, since new ones would import torch each time; and the seconds it took."""
+    trained = replace(setting, model={**setting.model, "lr": 1e-3}, trainer={"max_epochs": 2})
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (footprint, whole_training):
+            patch.setattr(module, "in_a_process", lambda measure, *args: measure(*args))
+        start = time.perf_counter()
+        report = measure_all(trained, batches=[6], frames=[6, 12], steps=2, repetitions=4, workers=1, sought_m=100.0)
+        return report, time.perf_counter() - start
 
 
-@pytest.mark.slow
-def test_everything_is_measured_in_one_run(setting, tmp_path, capsys):
-    start = time.perf_counter()
-    report = measure_all(setting, batches=[6], frames=[6, 12], steps=2, repetitions=4, workers=1)
-    taken = time.perf_counter() - start
+def check_footprints(footprints):
+    assert all(each.first_step_s > 0 and each.host_bytes > 2**27 for each in footprints)
+
+
+def check_whole_training(whole, frames, steps):
+    assert (whole.frames, whole.steps) == (frames, steps)
+    assert 0 < whole.first_step_s < whole.reached_s < whole.ended_s
+    assert 0 < whole.position_error_m < 10
+
+
+def test_every_figure_is_measured(measured):
+    report, taken = measured
     assert set(report.speed.training) == {OURS, REFERENCE, LOOP_ALONE}
     assert set(report.speed.batches) == {4, 6}
     assert set(report.speed.parts[OURS]) == set(PARTS)
@@ -183,14 +179,19 @@ def test_everything_is_measured_in_one_run(setting, tmp_path, capsys):
     seconds = [s for rates in report.speed.training.values() for s in (8 / rate for rate in rates)]
     assert sum(seconds) < taken  # of steps of 4 images: nothing is counted twice
     assert all(min(taken) >= 0 for way in report.speed.parts.values() for taken in way.values())
-    assert set(report.savings.left_out) == set(SAVINGS)
-    assert report.savings.gis
+    assert [each.way for each in report.footprints] == [OURS, REFERENCE]
     assert [each.frames for each in report.scaling] == [6, 12]
-    assert all(each.first_step_s > 0 and each.host_bytes > 2**27 for each in (*report.footprints, *report.scaling))
+    check_footprints([*report.footprints, *report.scaling])
+    check_whole_training(report.whole, frames=12, steps=6)
+
+
+def test_the_report_is_printed_and_written(measured, tmp_path, capsys):
+    report, _ = measured
     print_report(report, "this machine")
     said = capsys.readouterr().out
-    for words in ("training", "evaluation", "backward", "as published", "GIS", "GFLOP", "first step", "this machine"):
+    for words in ("training", "evaluation", "backward", "reference", "first step", "seconds grow", "this machine"):
         assert words in said
+    assert "100.0 m on validation frames (sequences) after " in " ".join(said.split())
     write_report(report, tmp_path / "speed.json", "this machine")
     told = json.loads((tmp_path / "speed.json").read_text())
     assert told["speed"]["training"][OURS] == report.speed.training[OURS]
@@ -199,15 +200,22 @@ def test_everything_is_measured_in_one_run(setting, tmp_path, capsys):
         write_report(report, tmp_path / "nowhere/speed.json", "this machine")
 
 
+def test_a_process_is_new():
+    assert in_a_process(os.getpid) != os.getpid()
+
+
+@pytest.mark.nightly
 @pytest.mark.slow
-def test_a_whole_training_from_its_process_start(setting, capsys):
-    trained = Setting("mambaloc", {**setting.model, "lr": 1e-3}, {**setting.data, "keep_count": 5}, {"max_epochs": 2})
-    whole = measure_whole_training(trained, 100.0)
-    assert (whole.frames, whole.steps) == (5, 4)
-    assert 0 < whole.first_step_s < whole.reached_s < whole.ended_s
-    assert 0 < whole.position_error_m < 10
-    print_whole_training(whole, Console(highlight=False))
-    assert "100.0 m on validation frames (sequences) after " in capsys.readouterr().out
+def test_processes_of_their_own(setting):
+    """Five that import torch; what they measure, the tests above guard in one."""
+    check_footprints([*measure_footprints(setting, 2, 1), *measure_scaling(setting, [6, 12])])
+    trained = replace(
+        setting,
+        model={**setting.model, "lr": 1e-3},
+        data={**setting.data, "keep_count": 5},
+        trainer={"max_epochs": 2},
+    )
+    check_whole_training(measure_whole_training(trained, 100.0), frames=5, steps=4)
 
 
 @pytest.mark.parametrize(
@@ -219,11 +227,7 @@ def test_a_training_that_reaches_nothing(data, trainer, message):
         measure_whole_training(Setting("mambaloc", {}, data, trainer), 0.1)
 
 
-@pytest.mark.slow
 def test_a_system_without_a_published_form_is_measured_beside_the_loop(setting):
-    student = Setting("student", {"backbone": "resnet10t"}, setting.data)
-    report = measure_all(student, batches=[], steps=2, repetitions=4, workers=0)
-    assert report.savings is None
-    assert set(report.speed.training) == {OURS, REFERENCE}
-    with pytest.raises(InputError, match="has no published form"):
-        benchmark.savings.measure_savings(student, 2)
+    student = Setting("student", {"backbone": TINY_BACKBONE, "width": 16}, setting.data)
+    speed = measure_speed(student, batches=[], steps=2, repetitions=4, workers=0)
+    assert set(speed.training) == {OURS, REFERENCE}

@@ -190,8 +190,9 @@ def test_official_split_goes_by_the_listed_frames(make, scene, monkeypatch, coun
     (module.folder / "scene.json").write_text('{"rendered_by": "someone"}')
     assert module.describe()["official_split"] is False
     assert module.describe()["rendered"] is True
-    (module.folder / "scene.json").write_text("half a line")
-    assert module.describe()["rendered"] is False
+    for content in ("half a line", "[" * 100_000, "[]"):
+        (module.folder / "scene.json").write_text(content)
+        assert module.describe()["rendered"] is False
 
 
 def order(module: PoseDataModule, epoch: int) -> list[int]:

@@ -1,14 +1,14 @@
-"""The embedded scene's site, served; and a browser to look at it with."""
+"""A site, served, and a browser to look at it with; what costs seconds is made once for all workers, and read only."""
 
 import shutil
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import pytest
 
 from mambaloc.demo import build_site, embedded_film, serve
-from mambaloc.export import write_bundle
-from mambaloc.zoo.bundles import EMBEDDED, load_with_data, released_bundle
+from mambaloc.demo import film as film_module
+from mambaloc.demo.site import node_modules
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SWITCHES = [
@@ -25,28 +25,71 @@ SWITCHES = [
 
 
 @pytest.fixture(scope="session")
-def bundle():
-    return released_bundle()
+def bundle(made_once, scenes):
+    """A model that takes normalised tensors, and does not say how sure it is."""
+    return made_once("demo_bundle", lambda folder: _export(folder / "bundle", scenes, ("onnx",))) / "bundle"
 
 
 @pytest.fixture(scope="session")
-def raw_bundle(tmp_path_factory):
-    """Models that resize, crop and scale by themselves."""
-    out = tmp_path_factory.mktemp("raw") / "bundle"
-    write_bundle(*load_with_data(EMBEDDED), out, ("onnx", "fp16"), "pc", raw_input=True)
-    return out
+def raw_bundle(made_once, scenes):
+    """Models that resize, crop and scale by themselves, and say how sure they are."""
+
+    def make(folder):
+        _export(folder / "bundle", scenes, ("onnx", "fp16"), raw_input=True, knows_its_frames=True)
+
+    return made_once("demo_raw_bundle", make) / "bundle"
+
+
+def _export(out, scenes, formats, raw_input=False, knows_its_frames=False):
+    """Export a student that was never trained: its poses differ by centimetres from frame to frame of a film."""
+    import torch  # what is made already needs none of it
+
+    from mambaloc.data import PoseDataModule
+    from mambaloc.export import write_bundle
+    from mambaloc.models.student import LitStudent
+
+    size = (32, 40)
+    data = PoseDataModule("7scenes", scenes, "heads", image_size=size, short_side=36, validation="sequences")
+    data.setup("fit")
+    torch.manual_seed(0)
+    system = LitStudent(backbone="test_efficientnet", width=16, image_size=size)
+    head = system.network.head
+    head.position_scale.fit(4 * torch.randn(9, 3))
+    with torch.no_grad():
+        head.position[0].weight *= 30
+        head.rotation[0].bias.zero_()
+    system.provenance = {"data": data.describe()} if knows_its_frames else {}
+    write_bundle(system.eval(), data, out, formats, "web", raw_input=raw_input)
 
 
 @pytest.fixture(scope="session")
 def film():
-    return embedded_film()
+    """The film of the embedded scene, a tenth of its length."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(film_module, "_FRAMES", 24)
+        return embedded_film()
 
 
 @pytest.fixture(scope="session")
-def site(bundle, film, tmp_path_factory):
+def modules():
+    """What the page and its tests need of npm."""
     if shutil.which("npm") is None:
         pytest.skip("the page's libraries come by npm, which is not here")
-    return build_site(bundle, tmp_path_factory.mktemp("site") / "site", film)
+    modules = node_modules(dev=True)
+    without_dev = modules.parent.with_name(modules.parent.name.removesuffix("-dev"))
+    with suppress(FileExistsError):
+        without_dev.symlink_to(modules.parent)  # npm has brought them once
+    return modules
+
+
+@pytest.fixture(scope="session")
+def site(made_once, bundle, film, modules):
+    return made_once("demo_site", lambda folder: build_site(bundle, folder / "site", film)) / "site"
+
+
+@pytest.fixture(scope="session")
+def raw_site(made_once, raw_bundle, modules):
+    return made_once("demo_raw_site", lambda folder: build_site(raw_bundle, folder / "site")) / "site"
 
 
 @pytest.fixture(scope="session")
@@ -58,7 +101,7 @@ def served():
 @contextmanager
 def _served(site, **options):
     with serve(site, 0, **options) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         try:
             yield server
         finally:

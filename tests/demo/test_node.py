@@ -11,20 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mambaloc.demo.site import node_modules
 from mambaloc.runtime import Localiser, Preprocessing
-from mambaloc.runtime.bundle import rotation_deg
+from mambaloc.runtime.rotations import rotation_error_deg
 
 pytestmark = pytest.mark.slow
 HERE = Path(__file__).parent
 LOCALISER = resources.files("mambaloc.demo") / "web/localiser.js"
-
-
-@pytest.fixture(scope="module")
-def modules():
-    if shutil.which("npm") is None:
-        pytest.skip("needs Node.js, which is not here")
-    return node_modules(dev=True)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +44,7 @@ def test_poses_in_node_are_pythons(which, model, modules, localiser_file, reques
     for pose, frame in zip(found, frames, strict=True):
         expected = localiser.localise(folder / frame["file"])
         assert 1000 * np.linalg.norm(np.array(pose["position_m"]) - expected.position_m) < 1
-        assert rotation_deg(np.array(pose["quaternion_wxyz"]), expected.quaternion) < 0.1
+        assert rotation_error_deg(np.array(pose["quaternion_wxyz"]), expected.quaternion) < 0.1
 
 
 CASES = [  # (height, width) of the picture, short side, crop

@@ -22,8 +22,10 @@ def test_it_holds_what_it_speaks_of(site, bundle):
         assert (site / name).is_file()
     for name in re.findall(r'from "\./([^"]+)"', text):
         assert (site / name).is_file()
-    for name in json.loads((WEB / "vendor.json").read_text()):
+    declared = json.loads((WEB / "package.json").read_text())["dependencies"]
+    for name, source in json.loads((WEB / "vendor.json").read_text()).items():
         assert (site / name).stat().st_size > 500
+        assert source.partition("/")[0] in declared  # not of those that only tests need
     assert (site / "bundle/contract.json").read_bytes() == (bundle / "contract.json").read_bytes()
     assert not list(site.rglob("package*.json"))
 

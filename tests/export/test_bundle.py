@@ -10,7 +10,6 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
@@ -20,7 +19,7 @@ from mambaloc.export.precision import half_precision
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Localiser, Preprocessing
-from mambaloc.runtime.bundle import rotation_deg, verify_bundle
+from mambaloc.runtime.bundle import verify_bundle
 
 
 @pytest.fixture(scope="module")
@@ -201,11 +200,3 @@ def test_a_model_that_deviates_is_not_shipped(student, data, tmp_path, monkeypat
 def test_a_bundle_is_never_written_over(student, data, tmp_path):
     with pytest.raises(InputError, match="is there already"):
         write_bundle(student, data, tmp_path)
-
-
-def test_angles_against_scipy():
-    a, b = (Rotation.random(20, rng=seed) for seed in (0, 1))
-    expected = np.degrees((a.inv() * b).magnitude())
-    q, p = (r.as_quat(scalar_first=True) for r in (a, b))
-    np.testing.assert_allclose([rotation_deg(x, y) for x, y in zip(q, p, strict=True)], expected, atol=1e-9)
-    assert rotation_deg(q[0], -q[0]) == pytest.approx(0, abs=1e-9)

@@ -10,14 +10,11 @@ import cv2
 import numpy as np
 import pytest
 from captures import FLIP, FOCAL_PX, LENS, SIZE, Rendered
-from hypothesis import settings
 from recorded import Recording, record
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
 from mambaloc.rendering import Room, embedded_room, embedded_walk, render
-
-settings.register_profile("thorough", max_examples=2_000)
 
 
 @pytest.fixture(scope="session")
@@ -27,33 +24,39 @@ def room() -> Room:
 
 
 @pytest.fixture(scope="session")
-def rendered_once(room, tmp_path_factory) -> Rendered:
-    """Forty frames of a walk, distorted by OpenCV's own inverse of the lens."""
-    folder = tmp_path_factory.mktemp("captures") / "room"
-    (folder / "images").mkdir(parents=True)
+def rendered_once(made_once, request) -> Rendered:
+    """Forty frames of a walk, distorted by OpenCV's own inverse of the lens; read only."""
     walk = embedded_walk(40, seed=3, start_deg=20.0, step_deg=2.4)
     centre = ((SIZE[0] - 1) / 2 + 1.5, (SIZE[1] - 1) / 2 - 1.0)
     matrix = np.array([[FOCAL_PX, 0, centre[0]], [0, FOCAL_PX, centre[1]], [0, 0, 1]])
     coefficients = np.array([*LENS.values()])
+
+    def make(folder: Path) -> None:
+        _write_rendered(request.getfixturevalue("room"), Rendered(folder, walk, matrix, coefficients))
+
+    return Rendered(made_once("rendered", make), walk, matrix, coefficients)
+
+
+def _write_rendered(room: Room, rendered: Rendered) -> None:
+    """Render what each pixel of the distorted images sees, and list the images in ``transforms.json``."""
+    (rendered.folder / "images").mkdir()
     columns, rows = np.meshgrid(np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32))
     pixels = np.stack((columns, rows), axis=-1).reshape(-1, 1, 2)
-    rays = cv2.undistortPoints(pixels, matrix, coefficients).reshape(SIZE[1], SIZE[0], 2)
+    rays = cv2.undistortPoints(pixels, rendered.matrix, rendered.coefficients).reshape(SIZE[1], SIZE[0], 2)
     wide = np.array([[1.5 * FOCAL_PX, 0, SIZE[0]], [0, 1.5 * FOCAL_PX, SIZE[1]], [0, 0, 1]])
     where = (rays * 1.5 * FOCAL_PX + SIZE).astype(np.float32)
     frames = []
-    for number, world_from_cam in enumerate(walk):
+    for number, world_from_cam in enumerate(rendered.world_from_cam, start=1):
         rgb, _ = render(room, wide, world_from_cam, (2 * SIZE[0], 2 * SIZE[1]))
         seen = cv2.remap(rgb, where[..., 0], where[..., 1], cv2.INTER_LINEAR)
-        cv2.imwrite(str(folder / f"images/{number + 1:04d}.png"), seen[..., ::-1])
-        frames.append(
-            {"file_path": f"images/{number + 1:04d}.png", "transform_matrix": (world_from_cam @ FLIP).tolist()}
-        )
+        cv2.imwrite(str(rendered.folder / f"images/{number:04d}.png"), seen[..., ::-1])
+        pose = (world_from_cam @ FLIP).tolist()
+        frames.append({"file_path": f"images/{number:04d}.png", "transform_matrix": pose})
     told = {
-        "fl_x": FOCAL_PX, "fl_y": FOCAL_PX, "cx": centre[0] + 0.5, "cy": centre[1] + 0.5, "w": SIZE[0], "h": SIZE[1],
-        **LENS, "camera_model": "OPENCV", "frames": frames,
+        "fl_x": FOCAL_PX, "fl_y": FOCAL_PX, "cx": rendered.matrix[0, 2] + 0.5, "cy": rendered.matrix[1, 2] + 0.5,
+        "w": SIZE[0], "h": SIZE[1], **LENS, "camera_model": "OPENCV", "frames": frames,
     }  # fmt: skip
-    (folder / "transforms.json").write_text(json.dumps(told))
-    return Rendered(folder, walk, matrix, coefficients)
+    (rendered.folder / "transforms.json").write_text(json.dumps(told))
 
 
 @pytest.fixture

@@ -31,10 +31,13 @@ TOOL = Path(__file__).parents[2] / "tools" / "import_scene.py"
 
 
 @pytest.fixture(scope="session")
-def scene(rendered_once, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("imported") / "room"
-    import_scene(rendered_once.folder, folder, command="python tools/import_scene.py room")
-    return folder
+def scene(rendered_once, made_once):
+    """The capture as a scene; read only."""
+
+    def make(folder):
+        import_scene(rendered_once.folder, folder / "room", command="python tools/import_scene.py room")
+
+    return made_once("imported", make) / "room"
 
 
 def told(folder):
@@ -174,6 +177,18 @@ def test_bad_frames_are_left_out_and_named(rendered, tmp_path):
     assert said["frames"]["poses_without_image"] == 1
     assert said["sanity"]["verdict"].startswith("usable, but 3 of 40 frames are left out")
     assert "0008.png | image is truncated" in (tmp_path / "a/report.md").read_text()
+
+
+def test_a_frame_too_far_to_be_read_back_is_left_out(rendered, tmp_path):
+    def move(said):
+        said["frames"][3]["transform_matrix"][1][3] = -1.1e7
+
+    rendered.edit(move)
+    imported = import_scene(rendered.folder, tmp_path / "a")
+    assert {Path(file).name: rule for file, rule in imported.left_out.items()} == {
+        "0004.png": "position is farther than 1e+07 from the origin"
+    }
+    assert len(read_rows(tmp_path / "a")) == 39
 
 
 def test_images_of_another_shape_are_not_used(rendered, tmp_path):

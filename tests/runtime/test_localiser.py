@@ -18,7 +18,8 @@ from mambaloc.geometry import canonical
 from mambaloc.images import as_rgb, read_image
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Contract, Localiser, PoseFilter, Preprocessing, frames_of, smooth
-from mambaloc.runtime.report import follow
+from mambaloc.runtime.sources import PICTURES_HZ
+from mambaloc.runtime.video import follow
 
 DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 48}
 
@@ -198,7 +199,8 @@ def test_a_folder_is_read_by_name(tmp_path):
     frames, count = frames_of(tmp_path)
     listed = list(frames)
     assert count == 2
-    assert [(frame.name, frame.time_s) for frame in listed] == [("a.png", 0.0), ("b.png", 1.0)]
+    assert [(frame.name, frame.time_s) for frame in listed] == [("a.png", 0.0), ("b.png", 1 / PICTURES_HZ)]
+    assert [frame.time_s for frame in frames_of(tmp_path, pictures_hz=8)[0]] == [0, 1 / 8]
     np.testing.assert_array_equal(listed[0].image[..., ::-1], picture(seed=0))
 
 
@@ -262,8 +264,10 @@ def test_a_source_is_localised_frame_by_frame(model, tmp_path):
         cv2.imwrite(str(tmp_path / name), picture(seed=seed)[..., ::-1])
     localiser = Localiser(model)
     found = list(localiser.localise_each(tmp_path))
-    assert [time_s for time_s, _ in found] == [0, 1]
+    assert [time_s for time_s, _ in found] == [0, 1 / PICTURES_HZ]
     np.testing.assert_array_equal(found[1][1].position_m, localiser.localise(picture(seed=1)).position_m)
+    slower = localiser.localise_each(frames_of(tmp_path, pictures_hz=8)[0])
+    assert [time_s for time_s, _ in slower] == [0, 1 / 8]
 
 
 def test_what_was_found_before_a_bad_picture_is_kept(model, tmp_path):
@@ -297,7 +301,7 @@ def test_a_filters_poses_are_written(filtering, model, pictures, tmp_path):
     done = follow(Localiser(model), str(pictures), tmp_path / "poses.tum", filtering)
     written = np.loadtxt(tmp_path / "poses.tum")
     assert (done.count, done.outliers) == (40, sum(pose.is_outlier for pose in expected))
-    np.testing.assert_array_equal(written[:, 0], np.arange(40))
+    np.testing.assert_allclose(written[:, 0], times_s, atol=1e-8)  # what the filter was given
     np.testing.assert_allclose(written[:, 1:4], [pose.position_m for pose in expected], atol=1e-6)
     np.testing.assert_allclose(written[:, [7, 4, 5, 6]], [pose.quaternion for pose in expected], atol=1e-6)
     jerks = (np.abs(np.diff(way, 2, axis=0)).mean() for way in (written[:, 1:4], positions_m))
@@ -331,3 +335,6 @@ def test_what_is_no_source(tmp_path):
     for source, message in (("empty", "holds no picture"), ("film.mp4", "cannot be opened"), ("none", "no such file")):
         with pytest.raises(InputError, match=message):
             frames_of(tmp_path / source)
+    for rate_hz in (0, -1, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="must be a positive number of frames per second"):
+            frames_of(tmp_path, pictures_hz=rate_hz)

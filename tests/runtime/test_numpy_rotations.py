@@ -39,6 +39,9 @@ def test_products_and_angles_equal_scipys():
     np.testing.assert_allclose(
         rotations.matrix_from_quaternion(rotations.conjugate(QUATERNIONS)), a.inv().as_matrix(), atol=1e-14
     )
+    between = rotations.rotation_vector_between(-QUATERNIONS[:, None], b.as_quat(scalar_first=True))  # all by all
+    expected = (a[3].inv() * b[5]).as_rotvec()
+    np.testing.assert_allclose(between[3, 5], expected, atol=1e-14)
     apart = rotations.rotation_error_deg(QUATERNIONS, -b.as_quat(scalar_first=True))
     np.testing.assert_allclose(apart, np.degrees((a.inv() * b).magnitude()), atol=1e-12)
 

@@ -1,4 +1,4 @@
-"""Reports of a small fixed store, cell by cell."""
+"""Reports of a small fixed store, trial by trial."""
 
 import csv
 import re
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from mambaloc.errors import InputError
-from mambaloc.sweep import Cell, Store, write_report
+from mambaloc.sweep import Store, Trial, report
 from mambaloc.sweep.paper import paper_tables
+from mambaloc.sweep.report import write_report
 from mambaloc.sweep.summary import differences, rows_of
 
 FRAMES = 60
@@ -47,12 +48,12 @@ def result(system, gis, errors_m, retrieval_m=None, scene="redkitchen", official
 
 
 def stored(folder, told):
-    """Keep results by their labels; None is a cell that failed."""
+    """Keep results by their labels; None is a trial that failed."""
     with Store(folder) as store:
         for number, (place, found) in enumerate(told.items()):
             labels = dict(zip(("system", "gis", "seed"), place, strict=True))
-            cell = Cell(labels, ("r.yaml",), str(number))
-            store.write(cell, {"last": found} if found else {}, 1.0, None if found else "ValueError: <script>")
+            trial = Trial(labels, ("r.yaml",), str(number))
+            store.write(trial, {"last": found} if found else {}, 1.0, None if found else "ValueError: <script>")
     return folder
 
 
@@ -62,7 +63,7 @@ def store(tmp_path):
     errors = {
         ("a", "none", "0"): hard + 0.2,
         ("a", "none", "1"): hard + 0.3,
-        ("a", "gis", "1"): hard + 0.1,  # cells that run side by side end in any order
+        ("a", "gis", "1"): hard + 0.1,  # trials that run side by side end in any order
         ("a", "gis", "0"): hard,
         ("b|<i>", "none", "0"): hard,
         ("b|<i>", "gis", "0"): hard[::-1],
@@ -114,7 +115,7 @@ def test_differences_are_paired_by_seed_and_frame(store):
     other = found["b|<i>"]["position_error_m"]  # the same errors on other frames: no difference, and no certainty
     assert other.mean == pytest.approx(0)
     assert not other.is_sure
-    with pytest.raises(InputError, match="no cell that ended has classical there"):
+    with pytest.raises(InputError, match="no trial that ended has classical there"):
         differences(Store.ended(folder).values(), "gis", "none", "classical")
 
 
@@ -198,7 +199,9 @@ def test_the_files_say_the_same(store, tmp_path):
     assert r"b|<i> & none & 0 & " in (tmp_path / "report/tables/results.tex").read_text()
 
 
-def test_training_time_to_an_error_that_is_asked_for(store, tmp_path):
+def test_training_time_to_an_error_that_is_asked_for(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "plots_of", lambda *_: [])  # drawn by the test above
+    monkeypatch.setattr(report, "paper_tables", lambda *_: [])
     write_report(store[0], tmp_path / "report", reach_m=0.85)
     with (tmp_path / "report/tables/training_time.csv").open(newline="") as file:
         header, *lines = csv.reader(file)
@@ -220,8 +223,8 @@ def test_what_cannot_be_reported(store, tmp_path):
 SCENES = ("heads", "fire", "redkitchen", "chess", "office", "pumpkin", "stairs")
 
 
-@pytest.fixture
-def tables(tmp_path):
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory):
     """What the paper's tables say of two seeds of all seven scenes, and one of blocks of a sequence."""
 
     def errors(median_m):
@@ -240,8 +243,8 @@ def tables(tmp_path):
         ("mambaloc", f"blocks 1/{k}", "0"): result("transposenet", "gis", errors(0.3 * k), keep_every=k)
         for k in (1, 10, 20)
     }
-    cells = Store.ended(stored(tmp_path / "results", told)).values()
-    return {table.name: table for table in paper_tables(cells)}
+    trials = Store.ended(stored(tmp_path_factory.mktemp("paper") / "results", told)).values()
+    return {table.name: table for table in paper_tables(trials)}
 
 
 def test_papers_tables_hold_ours_beside_its_figures(tables):

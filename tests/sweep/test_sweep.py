@@ -1,6 +1,7 @@
-"""Matrices: what their cells are, and that every cell runs once, whatever happens meanwhile."""
+"""Sweeps: what their trials are, and that every trial runs once, whatever happens meanwhile."""
 
 import signal
+import sqlite3
 import subprocess
 import sys
 import textwrap
@@ -13,30 +14,30 @@ import yaml
 
 from mambaloc.cli import recipe_arguments
 from mambaloc.errors import InputError
-from mambaloc.sweep import Store, print_plan, read_matrix, run_matrix, running
+from mambaloc.sweep import Store, print_plan, read_sweep, run_sweep, running
 from mambaloc.sweep.running import run_folder
 
 FAKE = textwrap.dedent(
     """
     import json, os, sys, time
     from pathlib import Path
-    words = sys.argv[1:]
-    run = Path(words[-1])
-    if "--raise" in words:
+    args = sys.argv[1:]
+    run = Path(args[-1])
+    if "--raise" in args:
         raise ValueError("nothing works")
-    if "--hang" in words:
+    if "--hang" in args:
         time.sleep(600)
-    if "--memory" in words:
+    if "--memory" in args:
         os.kill(os.getpid(), 9)
-    if "--nothing" in words:
+    if "--nothing" in args:
         sys.exit()
-    time.sleep(0.2 if "--slow" in words else 0)
+    time.sleep(0.2 if "--slow" in args else 0)
     out = run / "evaluation/last"
     out.mkdir(parents=True)
     (out / "predictions.csv").write_text("image,position_error_m,rotation_error_deg\\nseq-01/a.png,0.5,2\\n")
-    (out / "metrics.json").write_text(json.dumps({"metrics": {"position_error_m": 0.5}, "words": words}))
+    (out / "metrics.json").write_text(json.dumps({"metrics": {"position_error_m": 0.5}, "args": args}))
     with open(os.environ["TRIED"], "a") as file:
-        file.write(" ".join(words[:-2]) + "\\n")
+        file.write(" ".join(args[:-2]) + "\\n")
     """
 )
 
@@ -52,10 +53,10 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def matrix_of(folder, **told):
-    path = folder / "matrix.yaml"
+def sweep_of(folder, **told):
+    path = folder / "sweep.yaml"
     path.write_text(yaml.safe_dump(told, sort_keys=False))
-    return read_matrix(path)
+    return read_sweep(path)
 
 
 def six(folder, **others):
@@ -63,7 +64,7 @@ def six(folder, **others):
         "system": {"a": ["r.yaml", "--a"], "b": ["r.yaml", "--b"]},
         "seed": {str(n): ["--seed_everything", n] for n in range(3)},
     }
-    return matrix_of(folder, axes=axes, always=["--slow"], **others)
+    return sweep_of(folder, axes=axes, common_args=["--slow"], **others)
 
 
 def tried(folder):
@@ -71,45 +72,45 @@ def tried(folder):
     return path.read_text().splitlines() if path.exists() else []
 
 
-# --- cells ------------------------------------------------------------------------------------------------------------
+# --- trials -----------------------------------------------------------------------------------------------------------
 
 
-def test_every_combination_is_a_cell_with_files_before_options(folder):
+def test_every_combination_is_a_trial_with_files_before_options(folder):
     (folder / "o.yaml").write_text("data: {}\n")
     axes = {
         "system": {"a": ["r.yaml", "--lr", 1e-4]},
         "gis": {"none": ["o.yaml"], "gis": ["o.yaml", "--model.gis", "gis"]},
         "seed": {0: ["--seed_everything", 0], 1: ["--seed_everything", 1]},
     }
-    cells = matrix_of(folder, axes=axes, always=["--flag", True], without=[{"gis": "none", "seed": 1}]).cells
-    assert [dict(cell.labels) for cell in cells] == [
+    trials = sweep_of(folder, axes=axes, common_args=["--flag", True], exclude=[{"gis": "none", "seed": 1}]).trials
+    assert [dict(trial.labels) for trial in trials] == [
         {"system": "a", "gis": "none", "seed": "0"},
         {"system": "a", "gis": "gis", "seed": "0"},
         {"system": "a", "gis": "gis", "seed": "1"},
     ]
-    assert cells[1].words == (
+    assert trials[1].args == (
         *("r.yaml", "o.yaml", "--lr", "0.0001", "--flag", "true", "--model.gis", "gis", "--seed_everything", "0"),
     )
-    assert len({cell.key for cell in cells}) == 3
+    assert len({trial.key for trial in trials}) == 3
 
 
 def test_a_key_changes_with_what_a_recipe_says(folder):
-    before = [cell.key for cell in six(folder).cells]
-    assert [cell.key for cell in six(folder).cells] == before
+    before = [trial.key for trial in six(folder).trials]
+    assert [trial.key for trial in six(folder).trials] == before
     (folder / "r.yaml").write_text("model: {lr: 1}\n")
-    assert not set(before) & {cell.key for cell in six(folder).cells}
+    assert not set(before) & {trial.key for trial in six(folder).trials}
 
 
-def test_a_cell_comes_after_the_one_whose_run_it_needs(folder):
+def test_a_trial_comes_after_the_one_whose_run_it_needs(folder):
     axes = {
         "system": {"second": ["r.yaml", "--from", "{system=first}/last.ckpt"], "first": ["r.yaml"]},
         "seed": {0: ["--s", 0], 1: ["--s", 1]},
     }
-    cells = matrix_of(folder, axes=axes).cells
-    by_name = {cell.name: cell for cell in cells}
-    assert [cell.name for cell in cells][:2] == ["first 0", "first 1"]
+    trials = sweep_of(folder, axes=axes).trials
+    by_name = {trial.name: trial for trial in trials}
+    assert [trial.name for trial in trials][:2] == ["first 0", "first 1"]
     assert by_name["second 1"].after == (by_name["first 1"].key,)
-    run_matrix(matrix_of(folder, axes=axes), folder / "out")
+    run_sweep(sweep_of(folder, axes=axes), folder / "out")
     run = run_folder(folder / "out", by_name["first 0"].key)
     assert f"r.yaml --from {run}/last.ckpt --s 0" in tried(folder)
 
@@ -122,41 +123,43 @@ def test_a_cell_comes_after_the_one_whose_run_it_needs(folder):
         ({"axes": {"a": {}}}, "axis a has no labels"),
         ({"axes": {"a": {"x": "r.yaml"}}}, "give a list of recipes"),
         ({"axes": {"a": {"x": ["none.yaml"]}}}, "none.yaml cannot be read"),
-        ({"axes": {"a": {"x": ["r.yaml"]}}, "seeds": 3}, "has seeds; a matrix has axes"),
+        ({"axes": {"a": {"x": ["r.yaml"]}}, "seeds": 3}, "has seeds; a sweep has axes"),
+        ({"axes": {"a": {"x": ["r.yaml"]}}, "always": []}, "'always' is now called 'common_args'. Rename"),
+        ({"axes": {"a": {"x": ["r.yaml"]}}, "without": []}, "'without' is now called 'exclude'. Rename"),
         ({"axes": {"a": {"x": ["r.yaml"]}}, "cpus": 0}, "cpus is 0"),
         ({"axes": {"a": {"x": ["r.yaml"]}}, "time_limit_s": "long"}, "time_limit_s is 'long'"),
-        ({"axes": {"a": {"x": ["r.yaml"]}}, "without": [{"a": "y"}]}, "names no place"),
-        ({"axes": {"a": {"x": ["r.yaml"]}}, "without": [{"a": "x"}]}, "leaves out every cell"),
+        ({"axes": {"a": {"x": ["r.yaml"]}}, "exclude": [{"a": "y"}]}, "names no place"),
+        ({"axes": {"a": {"x": ["r.yaml"]}}, "exclude": [{"a": "x"}]}, "excludes every trial; exclude fewer"),
         ({"axes": {"a": {"x": ["r.yaml", "{b=1}"]}}}, "names the axis b"),
-        ({"axes": {"a": {"x": ["r.yaml", "{a=y}"]}}}, "which is left out"),
+        ({"axes": {"a": {"x": ["r.yaml", "{a=y}"]}}}, "which is excluded"),
         ({"axes": {"a": {"x": ["r.yaml", "{a=y}"], "y": ["r.yaml", "{a=x}"]}}}, "break the circle"),
     ],
 )
-def test_what_is_no_matrix(folder, told, message):
+def test_what_is_no_sweep(folder, told, message):
     with pytest.raises(InputError, match=message) as error:
-        matrix_of(folder, **told)
-    assert "matrix.yaml" in str(error.value)
+        sweep_of(folder, **told)
+    assert "sweep.yaml" in str(error.value)
 
 
 # --- running ----------------------------------------------------------------------------------------------------------
 
 
-def test_every_cell_runs_once(folder):
-    assert run_matrix(six(folder), folder / "out") == {"done": 6, "failed": 0, "found": 0}
+def test_every_trial_runs_once(folder):
+    assert run_sweep(six(folder), folder / "out") == {"done": 6, "failed": 0, "found": 0}
     assert len(set(tried(folder))) == 6
-    assert run_matrix(six(folder), folder / "out") == {"done": 6, "failed": 0, "found": 6}
+    assert run_sweep(six(folder), folder / "out") == {"done": 6, "failed": 0, "found": 6}
     assert len(tried(folder)) == 6
     with Store(folder / "out") as store:
         kept = store.read()
-    assert [cell.labels["system"] for cell in kept.values()] == ["a", "a", "a", "b", "b", "b"]
-    assert all(cell.results["last"]["metrics"] == {"position_error_m": 0.5} for cell in kept.values())
-    assert all(cell.seconds > 0.2 for cell in kept.values())
+    assert [trial.labels["system"] for trial in kept.values()] == ["a", "a", "a", "b", "b", "b"]
+    assert all(trial.results["last"]["metrics"] == {"position_error_m": 0.5} for trial in kept.values())
+    assert all(trial.seconds > 0.2 for trial in kept.values())
 
 
-def test_another_matrixs_cells_in_the_store_are_not_counted(folder):
-    run_matrix(six(folder), folder / "out")
-    other = matrix_of(folder, axes={"system": {"c": ["r.yaml"]}})
-    assert run_matrix(other, folder / "out") == {"done": 1, "failed": 0, "found": 0}
+def test_another_sweeps_trials_in_the_store_are_not_counted(folder):
+    run_sweep(six(folder), folder / "out")
+    other = sweep_of(folder, axes={"system": {"c": ["r.yaml"]}})
+    assert run_sweep(other, folder / "out") == {"done": 1, "failed": 0, "found": 0}
 
 
 def test_what_fails_is_recorded_and_the_rest_goes_on(folder):
@@ -170,32 +173,32 @@ def test_what_fails_is_recorded_and_the_rest_goes_on(folder):
             "works": ["r.yaml"],
         }
     }
-    matrix = matrix_of(folder, axes=axes, time_limit_s=3)
-    assert run_matrix(matrix, folder / "out") == {"done": 1, "failed": 5, "found": 0}
+    sweep = sweep_of(folder, axes=axes, time_limit_s=3)
+    assert run_sweep(sweep, folder / "out") == {"done": 1, "failed": 5, "found": 0}
     with Store(folder / "out") as store:
-        errors = {cell.labels["system"]: cell.error for cell in store.read().values()}
+        errors = {trial.labels["system"]: trial.error for trial in store.read().values()}
     assert errors.pop("works") is None
     assert errors.pop("raises") == "ValueError: nothing works"
     assert errors.pop("hangs") == "took longer than 3 s, and was stopped"
     assert errors.pop("memory") == "was killed, as when memory runs out"
     assert errors.pop("nothing") == "ended without an evaluation"
-    assert errors.pop("needs").startswith("needs the run of a cell that failed")
-    assert run_matrix(matrix, folder / "out")["found"] == 6
-    (folder / "fake.py").write_text(FAKE.replace('"--raise" in words', "False"))
-    assert run_matrix(matrix, folder / "out", retry_failed=True) == {"done": 3, "failed": 3, "found": 1}
+    assert errors.pop("needs").startswith("needs the run of a trial that failed")
+    assert run_sweep(sweep, folder / "out")["found"] == 6
+    (folder / "fake.py").write_text(FAKE.replace('"--raise" in args', "False").replace('"--hang" in args', "False"))
+    assert run_sweep(sweep, folder / "out", retry_failed=True) == {"done": 4, "failed": 2, "found": 1}
 
 
 def stored(out):
     with Store(out) as store:
-        return {key: (c.labels, c.words, c.error, c.results["last"]["metrics"]) for key, c in store.read().items()}
+        return {key: (c.labels, c.args, c.error, c.results["last"]["metrics"]) for key, c in store.read().items()}
 
 
 def test_killed_half_way_and_resumed_the_store_is_the_same(folder):
-    matrix = six(folder)
+    sweep = six(folder)
     program = (
-        "import sys; from pathlib import Path; from mambaloc.sweep import read_matrix, run_matrix, running\n"
+        "import sys; from pathlib import Path; from mambaloc.sweep import read_sweep, run_sweep, running\n"
         f"running.TRAIN = {running.TRAIN!r}; running.find_spec = lambda name: None\n"
-        "run_matrix(read_matrix(Path('matrix.yaml')), Path('out'))"
+        "run_sweep(read_sweep(Path('sweep.yaml')), Path('out'))"
     )
     process = subprocess.Popen([sys.executable, "-c", program])
     deadline = time.monotonic() + 60
@@ -208,33 +211,44 @@ def test_killed_half_way_and_resumed_the_store_is_the_same(folder):
     assert len(tried(folder)) == begun  # what it had started ended with it
     with Store(folder / "out") as store:
         assert 2 <= len(store.read()) < 6
-    run_matrix(matrix, folder / "out")
-    run_matrix(matrix, folder / "undisturbed")
+    run_sweep(sweep, folder / "out")
+    run_sweep(sweep, folder / "undisturbed")
     kept = [stored(folder / name) for name in ("out", "undisturbed")]
     assert kept[0] == kept[1]
     assert len(kept[0]) == 6
 
 
+def test_a_store_of_an_earlier_version_is_read(folder):
+    """Trials were cells, their args words; what ended is not run again."""
+    run_sweep(six(folder), folder / "out")
+    before = stored(folder / "out")
+    database = sqlite3.connect(folder / "out/results.sqlite")
+    database.executescript("ALTER TABLE trials RENAME TO cells; ALTER TABLE cells RENAME COLUMN args TO words")
+    database.close()
+    assert stored(folder / "out") == before
+    assert run_sweep(six(folder), folder / "out")["found"] == 6
+
+
 def test_two_processes_do_not_run_into_one_folder(folder):
-    matrix = six(folder)
+    sweep = six(folder)
     (folder / "out").mkdir()
-    with running._alone(folder / "out"), pytest.raises(InputError, match="another process runs cells into it"):
-        run_matrix(matrix, folder / "out")
+    with running._alone(folder / "out"), pytest.raises(InputError, match="another process runs trials into it"):
+        run_sweep(sweep, folder / "out")
 
 
 def test_a_store_that_is_none(folder):
     (folder / "out").mkdir()
     (folder / "out/results.sqlite").write_text("no database, but some text that is long enough to be read as a header")
     with pytest.raises(InputError, match="is no store of results"):
-        run_matrix(six(folder), folder / "out")
+        run_sweep(six(folder), folder / "out")
     (folder / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
-        run_matrix(six(folder), folder / "file")
+        run_sweep(six(folder), folder / "file")
 
 
 def test_an_address_needs_ray(folder):
     with pytest.raises(InputError, match=r"pip install 'mambaloc\[cluster\]'"):
-        run_matrix(six(folder), folder / "out", address="1.2.3.4:6379")
+        run_sweep(six(folder), folder / "out", address="1.2.3.4:6379")
 
 
 @pytest.mark.slow
@@ -245,10 +259,10 @@ def test_two_workers_of_a_local_ray(folder, monkeypatch):
     monkeypatch.setenv("TRIED", str(folder / "tried.txt"))
     monkeypatch.setattr(running, "TRAIN", (sys.executable, str(folder / "fake.py")))
     axes = {"system": {name: ["r.yaml", f"--{name}"] for name in ("raise", "hang", "memory", "a", "b", "c")}}
-    matrix = matrix_of(folder, axes=axes, time_limit_s=4)
-    assert run_matrix(matrix, folder / "out") == {"done": 3, "failed": 3, "found": 0}
+    sweep = sweep_of(folder, axes=axes, time_limit_s=4)
+    assert run_sweep(sweep, folder / "out") == {"done": 3, "failed": 3, "found": 0}
     with Store(folder / "out") as store:
-        errors = {cell.labels["system"]: cell.error for cell in store.read().values() if cell.error}
+        errors = {trial.labels["system"]: trial.error for trial in store.read().values() if trial.error}
     assert errors == {
         "raise": "ValueError: nothing works",
         "hang": "took longer than 4 s, and was stopped",
@@ -261,8 +275,8 @@ def test_two_workers_of_a_local_ray(folder, monkeypatch):
 def test_a_killed_supervisor_takes_its_training_along(tmp_path):
     told = tmp_path / "pid"
     sleep = f"import os, time, pathlib; pathlib.Path({str(told)!r}).write_text(str(os.getpid())); time.sleep(60)"
-    words = [sys.executable, str(running._SUPERVISOR), sys.executable, "-c", sleep]
-    supervisor = subprocess.Popen(words, stdin=subprocess.PIPE, start_new_session=True)
+    args = [sys.executable, str(running._SUPERVISOR), sys.executable, "-c", sleep]
+    supervisor = subprocess.Popen(args, stdin=subprocess.PIPE, start_new_session=True)
     wait_for(lambda: told.is_file() and told.read_text())
     supervisor.kill()
     supervisor.communicate()
@@ -277,50 +291,50 @@ def wait_for(happens, seconds=10):
         time.sleep(0.05)
 
 
-def test_a_real_training_is_a_cell(scenes, tiny_recipe, tmp_path, monkeypatch):
+def test_a_real_training_is_a_trial(scenes, tiny_recipe, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "find_spec", lambda name: None)
     axes = {"system": {"mambaloc": [str(tiny_recipe), "--trainer.max_epochs", 1]}}
-    matrix = matrix_of(tmp_path, axes=axes)
-    assert run_matrix(matrix, tmp_path / "out")["done"] == 1
+    sweep = sweep_of(tmp_path, axes=axes)
+    assert run_sweep(sweep, tmp_path / "out")["done"] == 1
     with Store(tmp_path / "out") as store:
-        (cell,) = store.read().values()
-    assert cell.results["last"]["count"] == 8
-    assert cell.results["last"]["training"]["wall_clock"]["train_s"] > 0
-    frames = cell.results["last"]["frames"]
+        (trial,) = store.read().values()
+    assert trial.results["last"]["count"] == 8
+    assert trial.results["last"]["training"]["wall_clock"]["train_s"] > 0
+    frames = trial.results["last"]["frames"]
     assert frames["image"][0].startswith("seq-03/")
     median_m = np.median(frames["position_error_m"])
-    assert median_m == pytest.approx(cell.results["last"]["metrics"]["position_error_m"], rel=1e-5)
-    assert run_folder(tmp_path / "out", cell.key).is_dir()
+    assert median_m == pytest.approx(trial.results["last"]["metrics"]["position_error_m"], rel=1e-5)
+    assert run_folder(tmp_path / "out", trial.key).is_dir()
 
 
-def test_every_shipped_matrix_names_recipes_that_are_there(monkeypatch, capsys):
+def test_every_shipped_sweep_names_recipes_that_are_there(monkeypatch, capsys):
     repository = Path(__file__).parents[2]
     monkeypatch.chdir(repository)
     shipped = sorted((repository / "recipes/sweeps").glob("*.yaml"))
     assert shipped
     for path in shipped:
-        matrix = read_matrix(path)
-        for words in {cell.words for cell in matrix.cells if cell.labels.get("seed", "0") == "0"}:
-            options = [word.replace("{system=posenet_learned}", "runs") for word in words]
+        sweep = read_sweep(path)
+        for args in {trial.args for trial in sweep.trials if trial.labels.get("seed", "0") == "0"}:
+            options = [arg.replace("{system=posenet_learned}", "runs") for arg in args]
             recipe_arguments(options)  # recipes and overlays first, and all there
-        print_plan(matrix, {})
-    assert "108 cells, 108 to run" in capsys.readouterr().out
+        print_plan(sweep, {})
+    assert "108 trials, 108 to run" in capsys.readouterr().out
 
 
 def test_a_plan_tells_what_ended_and_what_it_may_take(folder, capsys):
-    matrix = six(folder)
-    run_matrix(
-        matrix_of(
+    sweep = six(folder)
+    run_sweep(
+        sweep_of(
             folder,
             axes={"system": {"a": ["r.yaml", "--a"]}, "seed": {"0": ["--seed_everything", 0]}},
-            always=["--slow"],
+            common_args=["--slow"],
         ),
         folder / "out",
     )
     assert Store.ended(folder / "nothing") == {}
     assert not (folder / "nothing").exists()
-    print_plan(matrix, Store.ended(folder / "out"))
+    print_plan(sweep, Store.ended(folder / "out"))
     said = capsys.readouterr().out
     assert said.count("done") == 1
     assert said.count("to run") == 6
-    assert "6 cells, 5 to run" in said
+    assert "6 trials, 5 to run" in said

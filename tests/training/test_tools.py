@@ -54,6 +54,7 @@ def test_a_bundle_is_verified_and_localises(bundle, scenes, tmp_path, capsys):
     assert "8 poses" in capsys.readouterr().out
     poses = np.loadtxt(tmp_path / "poses.tum")
     assert poses.shape == (8, 8)
+    np.testing.assert_allclose(poses[:, 0], np.arange(8) / 30, atol=1e-8)
     np.testing.assert_allclose(np.linalg.norm(poses[:, 4:], axis=1), 1, atol=1e-5)
     tool("localize", bundle, scenes / "heads/seq-03", "--filter", "smooth", "--out", tmp_path / "smooth.tum")
     assert "8 poses (0 outliers)" in capsys.readouterr().out

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,12 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from mambaloc.data.frames import BadFrames, Frames, Split
+from mambaloc.data.datasets.dataset import Dataset
+from mambaloc.data.frames import FARTHEST, UNIT_TOLERANCE, BadFrames, Frames, Split
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
-from mambaloc.geometry import canonical
+from mambaloc.images import LARGEST_SIDE_PX
+from mambaloc.runtime.rotations import canonical
+
+CAPTURE = "capture"
+"""Name of the dataset whose scenes ``tools/import_scene.py`` made, each named by its folder's path."""
 
 SCENE_FILE, FRAMES_FILE = "scene.json", "frames.csv"
 VERSION_KEY, VERSION = "mambaloc_scene", 1
@@ -28,9 +31,6 @@ COLUMNS = ("image", "sequence", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz",
 SPLITS = ("train", "val", "test", "unused")
 
 MOST_FRAMES = 200_000
-_MOST_METRES = 1e7  # beyond, float32 is off by a metre
-_UNIT_TOLERANCE = 1e-3
-_MOST_PIXELS = 32768
 _SAME_RATIO = 0.05
 _MEND = "import the scene again"
 
@@ -46,13 +46,18 @@ class Row:
     split: str
 
 
+def scene_note(folder: Path) -> dict[str, Any]:
+    """What a folder's ``scene.json`` says, whatever wrote it; empty where there is none that can be read."""
+    try:
+        note = read_json(folder / SCENE_FILE, _MEND, _MEND)
+    except InputError:
+        return {}
+    return note if isinstance(note, dict) else {}
+
+
 def is_captured(folder: Path) -> bool:
     """Whether a folder is an imported scene, of whatever version."""
-    try:
-        told = json.loads((folder / SCENE_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(told, dict) and VERSION_KEY in told
+    return VERSION_KEY in scene_note(folder)
 
 
 def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
@@ -77,7 +82,7 @@ def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
         tuple(row.image for row in kept),
         tuple(row.sequence for row in kept),
         poses[:, :3].copy(),
-        canonical(torch.from_numpy(poses[:, 3:].copy())).numpy(),
+        canonical(poses[:, 3:]),
     )
 
 
@@ -161,7 +166,7 @@ def _focal_ratio(folder: Path, name: str, told: Any) -> float:
         width, focal_px = float(told["width"]), float(told["focal_px"][0])
     except (TypeError, ValueError, KeyError, IndexError, OverflowError):
         width = focal_px = math.nan
-    if not (1 <= width <= _MOST_PIXELS and 0 < focal_px < math.inf):
+    if not (1 <= width <= LARGEST_SIDE_PX and 0 < focal_px < math.inf):
         raise InputError(f"{folder / SCENE_FILE}: camera {name!r} has no width and focal length in pixels; {_MEND}")
     return focal_px / width
 
@@ -202,8 +207,11 @@ def _row(folder: Path, told: dict[str, str], where: str) -> Row:
     if not all(math.isfinite(value) for value in values.values()):
         raise InputError(f"{where}: has NaN or infinite numbers; correct the row")
     pose = tuple(values[name] for name in numbers[:7])
-    if max(map(abs, pose[:3])) > _MOST_METRES:
-        raise InputError(f"{where}: lies farther than {_MOST_METRES:g} from the origin; shift the world towards it")
-    if abs(math.hypot(*pose[3:]) - 1) > _UNIT_TOLERANCE:
+    if max(map(abs, pose[:3])) > FARTHEST:
+        raise InputError(f"{where}: lies farther than {FARTHEST:g} from the origin; shift the world towards it")
+    if abs(math.hypot(*pose[3:]) - 1) > UNIT_TOLERANCE:
         raise InputError(f"{where}: quaternion has length {math.hypot(*pose[3:]):.6g}, not 1; correct the row")
     return Row(image, told["sequence"], pose, told["camera"], told["split"])
+
+
+DATASET = Dataset(CAPTURE, read_split, {}, Path("scenes"), marks_validation=True)

@@ -2,44 +2,29 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from mambaloc.data.datasets import cambridge, capture, seven_scenes
-from mambaloc.data.download.origins import how_to_get
-from mambaloc.data.frames import BadFrames, Frames, Split
+from mambaloc.data.datasets.capture import CAPTURE
+from mambaloc.data.datasets.dataset import Dataset, Source, nearest
 from mambaloc.errors import InputError
 from mambaloc.user_cache import default_cache_dir
 
-CAPTURE = "capture"
-"""Scenes that ``tools/import_scene.py`` made, each named by its folder's path."""
+EMBEDDED = "embedded"
+"""Name of the generated room, which is laid out as 7-Scenes."""
 
-
-@dataclass(frozen=True)
-class Dataset:
-    """A kind of dataset: how a split of one of its scenes is read.
-
-    Args:
-        read_split: reads a scene's folder.
-        official_counts: train and test frames of each official scene; a scene of other counts is not the benchmark's.
-        default_root: where its scenes lie unless a recipe says otherwise.
-        marks_validation: whether its scenes may have a split ``val``, too.
-    """
-
-    read_split: Callable[[Path, Split, BadFrames], Frames]
-    official_counts: dict[str, tuple[int, int]]
-    default_root: Path
-    marks_validation: bool = False
-
-
-DATASETS: dict[str, Dataset] = {
-    "7scenes": Dataset(seven_scenes.read_split, seven_scenes.OFFICIAL_COUNTS, Path("data/7scenes")),
-    "cambridge": Dataset(cambridge.read_split, cambridge.OFFICIAL_COUNTS, Path("data/cambridge")),
-    "embedded": Dataset(seven_scenes.read_split, {}, default_cache_dir() / "scenes"),
-    CAPTURE: Dataset(capture.read_split, {}, Path("scenes"), marks_validation=True),
+DATASETS = {
+    dataset.name: dataset
+    for dataset in (
+        seven_scenes.DATASET,
+        cambridge.DATASET,
+        Dataset(EMBEDDED, seven_scenes.read_split, {}, default_cache_dir() / "scenes"),
+        capture.DATASET,
+    )
 }
+
+SOURCES = {name: dataset.source for name, dataset in DATASETS.items() if dataset.source}
+"""Where those come from that can be downloaded."""
 
 
 def locate(dataset: str, root: str | None, scene: str) -> tuple[str, str | None, str]:
@@ -68,32 +53,33 @@ def scene_folder(dataset: str, root: Path | None, scene: str) -> Path:
     if dataset not in DATASETS:
         raise InputError(f"data.dataset {dataset!r}: there is none; choose one of {', '.join(DATASETS)}")
     root = root or DATASETS[dataset].default_root
-    if dataset == "embedded":
+    if dataset == EMBEDDED:
         from mambaloc.rendering.scenes.embedded import ensure_embedded_scene
 
         return ensure_embedded_scene(root)
     if not (root / scene).is_dir():
-        raise InputError(_how_to_get(dataset, scene, root))
+        raise InputError(how_to_get(dataset, scene, root))
     return root / scene
 
 
-def _how_to_get(dataset: str, scene: str, root: Path) -> str:
+def how_to_get(dataset: str, scene: str, root: Path) -> str:
+    """One line on how to get a scene that is not in ``root``.
+
+    Raises:
+        InputError: for a dataset that can be neither imported nor downloaded.
+    """
     path = Path(scene) if Path(scene).name != scene else root / scene if dataset == CAPTURE else None
     if path is None and capture.is_captured(Path(scene)):
         return f"{scene} is not in {root}; if you mean the imported scene here, name its path: --data.scene ./{scene}"
     if path is None:
-        return how_to_get(dataset, scene, root)
+        return find_source(dataset).how_to_get(scene, root)
     source, out = (path, Path("scenes", path.name)) if path.is_dir() else ("CAPTURE", path)
     return f"{path}: is no imported scene; make one with: python tools/import_scene.py {source} --out {out}"
 
 
 def is_rendered(folder: Path) -> bool:
     """Whether a scene's ``scene.json`` says that it was rendered: no benchmark's pictures, whatever its poses."""
-    try:
-        note = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(note, dict) and "rendered_by" in note
+    return "rendered_by" in capture.scene_note(folder)
 
 
 def is_official(dataset: str, scene: str, listed: dict[str, int]) -> bool:
@@ -104,4 +90,31 @@ def is_official(dataset: str, scene: str, listed: dict[str, int]) -> bool:
     return all(official[split == "test"] == count for split, count in listed.items())
 
 
-__all__ = ["CAPTURE", "DATASETS", "Dataset", "is_official", "is_rendered", "locate", "scene_folder"]
+def find_source(dataset: str) -> Source:
+    """Where a dataset comes from.
+
+    Raises:
+        InputError: for one without a known address, with the nearest name.
+    """
+    if dataset not in SOURCES:
+        raise InputError(f"{dataset!r} is no dataset with a known address: {nearest(dataset, list(SOURCES))}")
+    return SOURCES[dataset]
+
+
+def licence_of_weights(dataset: str) -> str:
+    """Terms of weights that were trained on a dataset: its own; the project's, for scenes that it renders itself."""
+    if dataset == CAPTURE:
+        return "that of the capture's images, which only who took them can give"
+    source = SOURCES.get(dataset)
+    return f"{source.title}'s: {source.licence}; {source.terms}" if source else "Apache-2.0"
+
+
+def describe_sources() -> str:
+    """Datasets, licences, scenes and download sizes as text for the terminal."""
+    lines = []
+    for source in SOURCES.values():
+        lines += [f"{source.name}: {source.title}, {source.licence} ({source.terms})", f"  {source.page}"]
+        for scene, archive in source.archives.items():
+            size = f"{archive.size_bytes / 1e9:.1f} GB" if archive.size_bytes else "size told by the server"
+            lines.append(f"  {scene:<14} {size}")
+    return "\n".join(lines)

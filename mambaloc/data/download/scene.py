@@ -21,9 +21,10 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
+from mambaloc.data.datasets.dataset import Archive, Source
+from mambaloc.data.datasets.registry import find_source
 from mambaloc.data.download.archives import require_space, unpack
 from mambaloc.data.download.fetch import UnreachableError, fetch
-from mambaloc.data.download.origins import Archive, Source, find_scene, find_source
 from mambaloc.errors import InputError
 from mambaloc.files import sha256
 
@@ -61,7 +62,7 @@ def download(
     if scene is None:
         raise InputError(f"{source.name} needs a scene: give one of {', '.join(source.archives)}, or all")
     if scene != "all":
-        find_scene(source, scene)
+        source.find_scene(scene)
     root = source.default_root if root is None else root
     scenes = list(source.archives) if scene == "all" else [scene]
     return [_get(source, name, root, keep_archive, accept_changed, pause_s) for name in scenes]

@@ -20,6 +20,7 @@ from mambaloc.data.points.reconstructions import Reconstruction, plain_name, poi
 from mambaloc.data.points.scene_points import ScenePoints
 from mambaloc.errors import InputError
 from mambaloc.geometry import quaternion_from_matrix, resized_intrinsics
+from mambaloc.images import CORNER_PX
 
 
 def read_colmap_points(folder: Path, frames: Frames, count: int, seed: int) -> ScenePoints:
@@ -62,6 +63,6 @@ def _observed(model: Any, image: Any) -> NDArray[np.float64]:
 def _pinhole(camera: Any, size: tuple[int, int]) -> NDArray[np.float64]:
     """A camera's pinhole matrix in pixels of images of a size (width, height), (3, 3)."""
     focal, centre = (camera.focal_length_x, camera.focal_length_y), (camera.principal_point_x, camera.principal_point_y)
-    matrix = np.array([[focal[0], 0, centre[0] - 0.5], [0, focal[1], centre[1] - 0.5], [0, 0, 1]])
+    matrix = np.array([[focal[0], 0, centre[0] - CORNER_PX], [0, focal[1], centre[1] - CORNER_PX], [0, 0, 1]])
     scale = (size[0] / camera.width, size[1] / camera.height)
     return resized_intrinsics(torch.from_numpy(matrix), *scale).numpy()

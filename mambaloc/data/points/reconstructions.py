@@ -10,15 +10,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mambaloc.data.frames import Frames
+from mambaloc.data.frames import FARTHEST_M, Frames
 from mambaloc.data.points.scene_points import Points, ScenePoints, Source, choose, frame_rng, stacked
 from mambaloc.errors import InputError
 from mambaloc.geometry import rotation_error_deg
 
 TOLERANCE_M = 0.1
 TOLERANCE_DEG = 1.0
-FARTHEST_M = 1e5
-"""Points farther from the world's origin are triangulated from nearly parallel rays: noise, and left out."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +66,7 @@ def points_of_frames(
         row = model.rows[camera]
         intrinsics[row] = model.intrinsics[camera]
         seen = model.points_m[camera]
+        # Points farther from the world's origin are triangulated from nearly parallel rays.
         near = seen[np.abs(seen).max(axis=1, initial=0) <= FARTHEST_M]
         points[row] = choose(near, count, frame_rng(seed, frames.image_paths[row]))
     return ScenePoints(stacked(points, count), intrinsics.astype(np.float32), size_px, source)

@@ -16,8 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from mambaloc.images import Image, read_image
-from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import OPENCV_FROM_OPENGL
+from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.motion import Motion, apart, quaternions
 
 Floats = NDArray[np.float64]

@@ -6,16 +6,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from mambaloc.geometry import is_rotation
+from mambaloc.data.frames import FARTHEST, ROTATION_TOLERANCE
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.findings import Finding
 from mambaloc.importing.motion import Motion, quaternions
+from mambaloc.runtime.rotations import is_rotation
 
 LEAST_FRAMES = 20
-_ROTATION_TOLERANCE = 1e-2
 _DUPLICATE_SHARE = 1e-6  # of the extent
 _DUPLICATE_DEG = 1e-3
 _MANY = 0.1
@@ -29,22 +28,25 @@ def bad_poses(world_from_cam: NDArray[np.float64]) -> dict[int, str]:
         world_from_cam: (N, 4, 4).
     """
     found = {}
-    rotations = torch.from_numpy(world_from_cam[:, :3, :3].copy())
     is_finite = np.isfinite(world_from_cam).all(axis=(1, 2))
-    is_right = is_rotation(rotations, tolerance=_ROTATION_TOLERANCE).numpy()
+    is_right = is_rotation(world_from_cam[:, :3, :3], ROTATION_TOLERANCE)
     for row in np.flatnonzero(~(np.asarray(is_finite) & is_right)).tolist():
         pose = world_from_cam[row]
         found[row] = _broken(pose) if np.isfinite(pose).all() else "pose has NaN or infinite numbers"
     return found
 
 
+def far_poses(world_from_cam: NDArray[np.float64]) -> dict[int, str]:
+    """The rule that frames too far from the origin to be read back break, by row; poses as :func:`bad_poses`."""
+    is_far = (np.abs(world_from_cam[:, :3, 3]) > FARTHEST).any(axis=1)
+    return dict.fromkeys(np.flatnonzero(is_far).tolist(), f"position is farther than {FARTHEST:g} from the origin")
+
+
 def _broken(pose: NDArray[np.float64]) -> str:
     rotation = pose[:3, :3]
     determinant = float(np.linalg.det(rotation))
     scale = abs(determinant) ** (1 / 3)
-    if scale < 1e-6 or not np.allclose(
-        rotation @ rotation.T, scale**2 * np.eye(3), atol=_ROTATION_TOLERANCE * scale**2
-    ):
+    if scale < 1e-6 or not np.allclose(rotation @ rotation.T, scale**2 * np.eye(3), atol=ROTATION_TOLERANCE * scale**2):
         return "pose's rotation is not orthonormal"
     if determinant < 0:
         return "pose's rotation is left-handed: an axis is mirrored"

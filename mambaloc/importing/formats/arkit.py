@@ -23,15 +23,14 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.importing.capture import Camera, Capture
+from mambaloc.images import CORNER_PX
+from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import (
-    CORNER_PX,
-    OPENCV_FROM_OPENGL,
     Posed,
+    build_capture,
     from_quaternions,
-    gathered,
     pinhole,
-    rigid,
+    validate_se3,
 )
 from mambaloc.importing.formats.parsing import (
     array_of,
@@ -81,7 +80,7 @@ def read_record3d(source: Path) -> Capture:
     times = [None] * len(rows) if stamps is None else array_of(stamps, (len(rows),), "frameTimestamps", path).tolist()
     sequence = folder_name(source)
     present = [row for row in range(len(rows)) if row in numbered]
-    return gathered(
+    return build_capture(
         "record3d",
         source,
         [Posed(numbered[row], sequence, world_from_cam[row], names[row], times[row]) for row in present],
@@ -118,7 +117,7 @@ def read_polycam(source: Path) -> Capture:
         for file, (pose, _), name in zip(present, read, names, strict=True)
     ]
     corrected = folders[0].name.startswith("corrected")
-    return gathered(
+    return build_capture(
         "polycam",
         source,
         posed,
@@ -167,5 +166,5 @@ def _polycam_frame(path: Path) -> tuple[np.ndarray, Camera]:
     matrix = array_of([frame.get(key) for key in keys], (12,), "t_00 to t_23", path).reshape(1, 3, 4)
     fx, fy, cx, cy = array_of([frame.get(key) for key in ("fx", "fy", "cx", "cy")], (4,), "fx, fy, cx, cy", path)
     size = array_of([frame.get("width"), frame.get("height")], (2,), "width, height", path).tolist()
-    pose = rigid(matrix, lambda _: str(path))[0] @ OPENCV_FROM_OPENGL
+    pose = validate_se3(matrix, lambda _: str(path))[0] @ OPENCV_FROM_OPENGL
     return pose, pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path)

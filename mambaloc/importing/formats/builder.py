@@ -1,4 +1,4 @@
-"""From what a format says of its images to a capture: poses checked and made exactly rigid, images told apart."""
+"""Build a capture from what a format says of its images: poses and cameras are validated, and each image used once."""
 
 from __future__ import annotations
 
@@ -8,28 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from mambaloc.data.datasets.capture import MOST_FRAMES
+from mambaloc.data.frames import ROTATION_TOLERANCE, UNIT_TOLERANCE
 from mambaloc.errors import InputError
-from mambaloc.geometry import is_rotation, matrix_from_pose, normalize, pose_from_matrix
+from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture, Unit
-from mambaloc.types import Pose
+from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quaternion_from_matrix
 
 Matrices = NDArray[np.float64]
 
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Camera axes of OpenGL, ARKit and ARCore (x right, y up, z backwards) in OpenCV's, and the other way."""
-
-CORNER_PX = 0.5
-"""How far the corner of the top-left pixel is from its centre, where pixels are counted from here."""
-
-LARGEST_PX = 100_000
-"""Side of the largest images."""
-
-_FARTHEST = 1e9  # of any unit: more is no position
-_ROTATION_TOLERANCE = 1e-2
-_UNIT_TOLERANCE = 1e-3
+_FARTHEST = 1e9  # in a file's own unit and world: the importer shifts worlds that are far from their origin
 
 
 @dataclass(frozen=True)
@@ -44,7 +34,7 @@ class Posed:
     split: str | None = None
 
 
-def gathered(
+def build_capture(
     kind: str,
     source: Path,
     posed: Sequence[Posed],
@@ -68,11 +58,13 @@ def gathered(
         beside: images that are there, of which some may be among ``posed``.
 
     Raises:
-        InputError: where no image is left, or one is named twice.
+        InputError: for no image, one with two poses, or more than a scene may have.
     """
     if not posed:
         named = f"; {len(missing)} are named and missing, such as {missing[0]!r}" if missing else ""
         raise InputError(f"{source}: has no image with a pose{named}; add them")
+    if len(posed) > MOST_FRAMES:
+        raise InputError(f"{source}: lists {len(posed)} frames, more than {MOST_FRAMES}; keep fewer")
     used: set[Path] = set()
     for each in posed:
         if each.image in used:
@@ -99,7 +91,7 @@ def gathered(
     )
 
 
-def rigid(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
+def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
     """Check transforms, and make rotations that were rounded in a text exact.
 
     Args:
@@ -112,15 +104,12 @@ def rigid(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
     Raises:
         InputError: for a row that is no rigid transform.
     """
-    tensor = torch.from_numpy(matrices)
-    _refuse(
-        ~is_rotation(tensor[:, :3, :3], _ROTATION_TOLERANCE).numpy(), where, "the pose's rotation is not orthonormal"
-    )
+    rotation, position = matrices[:, :3, :3], matrices[:, :3, 3]
+    _refuse(~is_rotation(rotation, ROTATION_TOLERANCE), where, "the pose's rotation is not orthonormal")
     if matrices.shape[1] == 4:
         is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
         _refuse(~is_last, where, "the pose's last row is not 0 0 0 1")
-    _refuse(np.abs(matrices[:, :3, 3]).max(axis=1) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
-    return matrix_from_pose(pose_from_matrix(tensor)).numpy()
+    return _transforms(matrix_from_quaternion(quaternion_from_matrix(rotation)), position, where)
 
 
 def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[int], str]) -> tuple[Matrices, int]:
@@ -140,9 +129,8 @@ def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
     _refuse(~((norm > 0.5) & (norm < 2)), where, "the quaternion is far from unit length")
-    _refuse(np.abs(position).max(axis=1, initial=0) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
-    pose = Pose(torch.from_numpy(position.copy()), normalize(torch.from_numpy(quaternion.copy())))
-    return matrix_from_pose(pose).numpy(), int((np.abs(norm - 1) > _UNIT_TOLERANCE).sum())
+    world_from_cam = _transforms(matrix_from_quaternion(quaternion), position, where)
+    return world_from_cam, int((np.abs(norm - 1) > UNIT_TOLERANCE).sum())
 
 
 def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[float], where: str | Path) -> Camera:
@@ -158,15 +146,26 @@ def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[floa
         InputError: for a size that is none, or numbers that no lens has.
     """
     width, height = size
-    is_size = all(1 <= side <= LARGEST_PX and side == int(side) for side in size)
+    is_size = all(1 <= side <= LARGEST_SIDE_PX and side == int(side) for side in size)
     if not is_size or not all(np.isfinite([*focal, *centre])) or min(focal) <= 0:
-        raise InputError(f"{where}: a camera must have a size and finite, positive focal lengths; export it again")
+        raise InputError(
+            f"{where}: a camera must have a size and finite, positive focal lengths, and at most {LARGEST_SIDE_PX} "
+            "pixels a side; export it again"
+        )
     if not (abs(centre[0] - width / 2) <= width / 4 and abs(centre[1] - height / 2) <= height / 4):
         raise InputError(
             f"{where}: principal point {centre[0]:.0f}, {centre[1]:.0f} is far from the centre of images of "
             f"{width:.0f}x{height:.0f}; give the intrinsics of these images, not of others' size"
         )
     return Camera(int(width), int(height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
+
+
+def _transforms(rotation: Matrices, position: Matrices, where: Callable[[int], str]) -> Matrices:
+    """Homogeneous matrices of rotations (N, 3, 3) and positions (N, 3), which must not be too far away."""
+    _refuse(np.abs(position).max(axis=1, initial=0) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
+    matrices = np.tile(np.eye(4), (len(position), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = rotation, position
+    return matrices
 
 
 def _refuse(is_bad: Any, where: Callable[[int], str], rule: str) -> None:

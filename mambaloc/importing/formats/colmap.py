@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, is_sound, load_colmap
 from mambaloc.errors import InputError
+from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import CORNER_PX, LARGEST_PX, Posed, gathered, rigid
-from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures
+from mambaloc.importing.formats.builder import Posed, build_capture, validate_se3
+from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures_beside
 
 _PLACES = (*COLMAP_FOLDERS, ".")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -47,7 +48,7 @@ def read_colmap(source: Path) -> Capture:
     cam_from_world = np.array([image.cam_from_world().matrix() for image in images])
     if not np.isfinite(cam_from_world).all():
         raise InputError(f"{path}: has a pose with NaN or infinite numbers; export it again")
-    world_from_cam = np.linalg.inv(rigid(cam_from_world, lambda row: f"{path}, image {images[row].name[:80]!r}"))
+    world_from_cam = np.linalg.inv(validate_se3(cam_from_world, lambda row: f"{path}, image {images[row].name[:80]!r}"))
     cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(images)}
     posed, missing = [], []
     for image, file, pose in zip(images, files, world_from_cam, strict=True):
@@ -62,8 +63,8 @@ def read_colmap(source: Path) -> Capture:
         "origin": "kept",
         "model": path.relative_to(source).as_posix(),
     }
-    beside = [picture for folder in dict.fromkeys(each.image.parent for each in posed) for picture in pictures(folder)]
-    return gathered(
+    beside = pictures_beside(each.image for each in posed)
+    return build_capture(
         "colmap", source, posed, unit="unknown", choices=choices, cameras=cameras, missing=missing, beside=beside
     )
 
@@ -93,8 +94,13 @@ def _sequence(name: str, source: Path) -> str:
 
 
 def _camera(camera: Any, path: Path) -> Camera:
-    if not is_sound(camera) or max(camera.width, camera.height) > LARGEST_PX:
+    if not is_sound(camera):
         raise InputError(f"{path}: holds a camera without a size or a finite, positive focal length; export it again")
+    if max(camera.width, camera.height) > LARGEST_SIDE_PX:
+        raise InputError(
+            f"{path}: a camera has {camera.width}x{camera.height} pixels, more than {LARGEST_SIDE_PX} a side. "
+            "Make smaller images, and reconstruct from these."
+        )
     model = str(camera.model_name)
     return Camera(
         int(camera.width),

@@ -21,8 +21,8 @@ import numpy as np
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture, Unit
-from mambaloc.importing.formats.builder import Posed, from_quaternions, gathered
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, inside, pictures, read_text
+from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, inside, pictures_beside, read_text
 
 Direction = Literal["world_from_cam", "cam_from_world"]
 
@@ -95,10 +95,10 @@ def read_csv(source: Path, direction: Direction | None = None) -> Capture:
     }
     if mended:
         choices["quaternions"] = f"{mended} of {len(rows)} were not of unit length, and made so"
-    beside = [image for parent in dict.fromkeys(each.image.parent for each in posed) for image in pictures(parent)]
+    beside = pictures_beside(each.image for each in posed)
     kind = "csv" if direction is None else f"csv_{direction}"
     unit: Unit = "metre" if is_known else "unknown"
-    return gathered(kind, path, posed, unit=unit, choices=choices, missing=missing, beside=beside)
+    return build_capture(kind, path, posed, unit=unit, choices=choices, missing=missing, beside=beside)
 
 
 def _table(source: Path) -> Path:
@@ -168,7 +168,8 @@ def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
     scenes = list(dict.fromkeys(row.get("scene", "") for _, row in rows))
     if len(scenes) == 1:
         return rows
-    chosen = [(line, row) for line, row in rows if source.is_dir() and row["scene"] == folder_name(source)]
+    scene = folder_name(source) if source.is_dir() else None
+    chosen = [(line, row) for line, row in rows if row["scene"] == scene]
     if not chosen:
         raise InputError(
             f"{path}: holds the scenes {', '.join(scenes)[:200]}, each with a world of its own; give a table of one, "

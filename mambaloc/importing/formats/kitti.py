@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mambaloc.errors import InputError
 from mambaloc.images import read_image
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import Matrices, Posed, gathered, pinhole, rigid
+from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
     as_numbers,
     first_with_pictures,
@@ -52,7 +52,7 @@ def read_kitti(source: Path) -> Capture:
     """
     sequence = _only_sequence(source)
     table = read_table(_poses_file(sequence), 12, _ROW)
-    world_from_cam = rigid(table.numbers.reshape(-1, 3, 4), table.where)
+    world_from_cam = validate_se3(table.numbers.reshape(-1, 3, 4), table.where)
     folder = first_with_pictures([sequence / "image_2", sequence / "image_0"])
     images = pictures(folder)
     camera, cam0_from_cam = _camera(sequence / "calib.txt", folder.name, images[0])
@@ -66,7 +66,7 @@ def read_kitti(source: Path) -> Capture:
         else:
             missing.append(f"{folder.name}/{row:06d}{images[0].suffix}")
     moved = f"poses of camera 0, moved {np.linalg.norm(cam0_from_cam[:3, 3]) * 100:.1f} cm to {folder.name}'s"
-    return gathered(
+    return build_capture(
         "kitti",
         source,
         posed,
@@ -101,10 +101,10 @@ def read_kitti_poses(source: Path) -> Capture:
             "give as many, in the same order"
         )
     sequence = folder_name(found[0].parent)
-    poses = rigid(table.numbers.reshape(-1, 3, 4), table.where)
+    poses = validate_se3(table.numbers.reshape(-1, 3, 4), table.where)
     posed = [Posed(image, sequence, pose) for image, pose in zip(images, poses, strict=True)]
     choices = {**_CHOICES, "scale": "unknown: a pose file does not tell", "association": "in the order of file names"}
-    return gathered("kitti_poses", source, posed, unit="unknown", choices=choices)
+    return build_capture("kitti_poses", source, posed, unit="unknown", choices=choices)
 
 
 def _poses_file(sequence: Path) -> Path:

@@ -5,23 +5,20 @@ Each frame has a camera-to-world matrix in OpenGL's camera axes: x right, y up, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mambaloc.data.datasets.capture import MOST_FRAMES
 from mambaloc.errors import InputError
-from mambaloc.files import path_inside, read_json
 from mambaloc.images import PICTURES
-from mambaloc.importing.capture import Capture
-from mambaloc.importing.formats.builder import OPENCV_FROM_OPENGL
+from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
+from mambaloc.importing.formats.builder import Matrices, Posed, build_capture
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
-from mambaloc.importing.formats.parsing import natural
+from mambaloc.importing.formats.parsing import inside, natural, pictures_beside, read_object
+from mambaloc.runtime.rotations import is_rotation
 
 FILES: Mapping[str, str | None] = {
     "transforms.json": None,
@@ -32,21 +29,6 @@ FILES: Mapping[str, str | None] = {
 """Names of the file, the one that holds all frames first, and the split that its frames are of."""
 
 
-@dataclass(frozen=True)
-class _Listed:
-    """A frame as a file lists it; ``intrinsics`` hold the file's values where the frame has none of its own."""
-
-    name: str
-    image: Path
-    world_from_cam: NDArray[np.float64]
-    intrinsics: Mapping[str, Any]
-    split: str | None
-
-    @property
-    def sequence(self) -> str:
-        return self.name.rpartition("/")[0] or "images"
-
-
 def matches(source: Path) -> bool:
     """Whether a source holds such a file, or is one."""
     return source.name in FILES if source.is_file() else any((source / name).is_file() for name in FILES)
@@ -55,120 +37,113 @@ def matches(source: Path) -> bool:
 def read(source: Path) -> Capture:
     """Read a folder that holds such files, or one of them.
 
+    A pose that is not finite or no rotation is kept: the checks name its frame and leave it out.
+
     Raises:
-        InputError: for a file that is malformed, names an image outside of its folder or twice, or a camera that is
-            none; and where no image is there.
+        InputError: for a file that is malformed, or names an image outside of its folder or twice, or a camera that
+            cannot be one; and where none of its images is there.
     """
     files = [source] if source.is_file() else [source / name for name in FILES if (source / name).is_file()]
     if not files:
         raise InputError(f"{source}: holds none of {', '.join(FILES)}; give a folder that does")
     if files[0].name == "transforms.json":
         del files[1:]
-    told = {file: _read(file) for file in files}
-    listed = [frame for file, content in told.items() for frame in _frames(file, content)]
-    listed.sort(key=lambda frame: (natural(Path(frame.sequence)), natural(Path(frame.name))))
-    if twice := next((a.name for a, b in pairwise(listed) if a.name == b.name), None):
-        raise InputError(f"{source}: lists {twice} twice; remove one of the two")
-    present = [frame for frame in listed if frame.image.is_file()]
-    if not present:
-        raise InputError(f"{files[0]}: none of its {len(listed)} images is there, as {listed[0].image}; add them")
-    cameras, camera_of, said = read_cameras(
-        [frame.intrinsics for frame in present], [frame.image for frame in present], files[0]
+    contents = {file: _content(file) for file in files}
+    frames = [frame for file, content in contents.items() for frame in _frames(file, content)]
+    frames.sort(key=lambda frame: (natural(frame[0].image.parent), natural(frame[0].image)))
+    present = [frame for frame in frames if frame[0].image.is_file()]
+    images, folder = [posed.image for posed, _ in frames], files[0].parent
+    cameras, names, decided = read_cameras(
+        [intrinsics for _, intrinsics in present], [posed.image for posed, _ in present], files[0]
     )
-    splits = [frame.split for frame in present]
-    return Capture(
-        kind="nerfstudio",
-        images=tuple(frame.image for frame in present),
-        sequences=tuple(frame.sequence for frame in present),
-        world_from_cam=np.stack([frame.world_from_cam for frame in present]),
+    return build_capture(
+        "nerfstudio",
+        files[0],
+        [replace(posed, camera=name) for (posed, _), name in zip(present, names, strict=True)],
         unit="unknown",
-        choices={**_choices(files[0], told[files[0]]), "cameras": said},
+        choices={**_choices(files[0].name, contents[files[0]]), "cameras": decided},
         cameras=cameras,
-        camera_of=camera_of,
-        split=tuple(split or "unused" for split in splits) if any(splits) else None,
-        poses_without_image=tuple(frame.name for frame in listed if not frame.image.is_file()),
-        images_without_pose=_beside([frame.image for frame in listed]),
+        missing=[image.relative_to(folder).as_posix() for image in images if not image.is_file()],
+        beside=pictures_beside(images),
     )
 
 
-def _read(file: Path) -> dict[str, Any]:
-    content = read_json(file, "give one that can be", "export it again")
-    frames = content.get("frames") if isinstance(content, dict) else None
+def _content(file: Path) -> dict[str, Any]:
+    content = read_object(file, "'frames' of nerfstudio or instant-ngp")
+    frames = content.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{file}: has no list of 'frames'; give a transforms.json of nerfstudio or instant-ngp")
-    if len(frames) > MOST_FRAMES:
-        raise InputError(f"{file}: lists {len(frames)} frames, more than {MOST_FRAMES}; keep fewer")
     return content
 
 
-def _frames(file: Path, content: dict[str, Any]) -> Iterator[_Listed]:
-    original_from_file, scale = _undoing(file, content)
+def _frames(file: Path, content: dict[str, Any]) -> Iterator[tuple[Posed, dict[str, Any]]]:
+    """Each frame with its intrinsics: its own, and the file's where it has none."""
+    original_from_file, scale = _original_from_file(file, content)
     shared = {key: content[key] for key in KEYS if key in content}
     splits = _named_splits(file, content)
     for count, frame in enumerate(content["frames"], start=1):
         where = f"{file}, frame {count}"
         image = _image(file, frame.get("file_path"), f"{where}: file_path")
-        name = image.relative_to(file.parent).as_posix()
         world_from_cam = _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix") @ OPENCV_FROM_OPENGL
         world_from_cam[:3, 3] /= scale
-        own = {key: frame[key] for key in KEYS if key in frame}
-        split = FILES[file.name] if FILES.get(file.name) else splits.get(name)
-        yield _Listed(name, image, original_from_file @ world_from_cam, {**shared, **own}, split)
+        folder = image.parent.relative_to(file.parent)
+        sequence = folder.as_posix() if folder.name else "images"
+        split = FILES.get(file.name) or (splits.get(image, "unused") if splits else None)
+        posed = Posed(image, sequence, original_from_file @ world_from_cam, split=split)
+        yield posed, {**shared, **{key: frame[key] for key in KEYS if key in frame}}
 
 
-def _undoing(file: Path, content: dict[str, Any]) -> tuple[NDArray[np.float64], float]:
-    """What brings the file's poses back to the world that they were made in, once their positions are unscaled."""
+def _original_from_file(file: Path, content: dict[str, Any]) -> tuple[Matrices, float]:
+    """What takes the file's poses back to the world that they were made in, once positions are divided by a scale."""
     scale = number(content, "applied_scale", str(file))
     if scale is not None and not 1e-9 < scale < 1e9:
         raise InputError(f"{file}: applied_scale is {scale}; correct it, or remove it")
-    applied = np.eye(4)
-    if content.get("applied_transform") is not None:
-        applied = _matrix(content["applied_transform"], f"{file}: applied_transform")
-    rotation = applied[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+    if content.get("applied_transform") is None:
+        return np.eye(4), scale or 1.0
+    applied = _matrix(content["applied_transform"], f"{file}: applied_transform")
+    if not is_rotation(applied[:3, :3]) or not np.isfinite(applied).all():
         raise InputError(f"{file}: applied_transform is no rotation and shift; correct it, or remove it")
-    return np.linalg.inv(applied).astype(np.float64), 1.0 if scale is None else scale
+    return np.linalg.inv(applied).astype(np.float64), scale or 1.0
 
 
-def _choices(file: Path, content: dict[str, Any]) -> dict[str, str]:
+def _choices(file: str, content: dict[str, Any]) -> dict[str, str]:
     undone = [name for name in ("applied_transform", "applied_scale") if content.get(name) is not None]
-    world = f"{' and '.join(undone)} undone: that of the data which {file.name} was made of"
+    world = f"{' and '.join(undone)} undone: that of the data which {file} was made of"
     return {
         "axes": "OpenGL's (x right, y up, z back), turned to OpenCV's: the cameras' y and z axes are negated",
-        "direction": f"camera to world, as {file.name} has it",
-        "world": world if undone else f"that of {file.name}",
+        "direction": f"camera to world, as {file} has it",
+        "world": world if undone else f"that of {file}",
         "scale": "the format does not tell its unit",
         "order": "by file name, its numbers as numbers, since the format tells no time; a folder is a sequence",
     }
 
 
-def _named_splits(file: Path, content: dict[str, Any]) -> dict[str, str]:
-    """Splits by an image's name, where ``train_filenames`` and its like tell them."""
-    found: dict[str, str] = {}
+def _named_splits(file: Path, content: dict[str, Any]) -> dict[Path, str]:
+    """The split of each image of ``train_filenames`` and its like."""
+    splits: dict[Path, str] = {}
     for split in ("train", "val", "test"):
         key = f"{split}_filenames"
         names = content.get(key) or []
         if not isinstance(names, list):
             raise InputError(f"{file}: {key} is no list; correct it, or remove it")
-        found |= {_image(file, name, f"{file}: {key}").relative_to(file.parent).as_posix(): split for name in names}
-    return found
+        splits |= {_image(file, name, f"{file}: {key}"): split for name in names}
+    return splits
 
 
 def _image(file: Path, name: Any, where: str) -> Path:
-    """Find the image that a file names, with a suffix or without."""
-    path = path_inside(file.parent, name) if isinstance(name, str) else None
-    if path is None:
-        raise InputError(f"{where}: {str(name)[:80]!r} is no path inside of {file.parent}; correct it")
+    """The image that a file names, with its suffix or without."""
+    path = inside(file.parent, name, where)
     if path.suffix.lower() in PICTURES:
         return path
-    named = [path.with_name(path.name + suffix) for suffix in (*PICTURES, *(s.upper() for s in PICTURES))]
-    return next((each for each in named if each.is_file()), path)
+    stem = path.relative_to(file.parent).as_posix()
+    named = (inside(file.parent, stem + suffix, where) for suffix in (*PICTURES, *map(str.upper, PICTURES)))
+    return next((image for image in named if image.is_file()), path)
 
 
-def _matrix(told: Any, where: str) -> NDArray[np.float64]:
-    """A 4x4 or 3x4 matrix; NaN stays, and is left out with its frame."""
+def _matrix(rows: Any, where: str) -> Matrices:
+    """A 4x4 or 3x4 matrix as (4, 4); NaN and infinity are kept."""
     try:
-        matrix = np.array([[float(each) for each in row] for row in told])
+        matrix = np.array([[float(each) for each in row] for row in rows])
     except (ValueError, TypeError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)):
@@ -176,11 +151,3 @@ def _matrix(told: Any, where: str) -> NDArray[np.float64]:
     if np.isfinite(matrix[3:]).all() and not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
         raise InputError(f"{where}'s last row is not 0 0 0 1; correct it")
     return np.concatenate((matrix[:3], [[0.0, 0.0, 0.0, 1.0]]))
-
-
-def _beside(images: Sequence[Path]) -> tuple[Path, ...]:
-    """Pictures in the folders of listed images that are not listed."""
-    listed = set(images)
-    folders = [folder for folder in dict.fromkeys(image.parent for image in images) if folder.is_dir()]
-    pictures = [path for folder in folders for path in sorted(folder.iterdir()) if path.suffix.lower() in PICTURES]
-    return tuple(path for path in pictures if path not in listed)

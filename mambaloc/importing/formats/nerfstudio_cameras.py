@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mambaloc.errors import InputError
-from mambaloc.images import decode_image
+from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX, decode_image
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
 
@@ -24,40 +24,41 @@ KEYS = (
 """What a file, or a frame of it, says of a camera."""
 
 _BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
-_MOST_PIXELS = 32768
 _MOST_FOCAL_PX = 1e7
 _SAME_SHAPE = 0.01
 
 
 def read_cameras(
     intrinsics: Sequence[Mapping[str, Any]], images: Sequence[Path], file: Path
-) -> tuple[dict[str, Camera], tuple[str, ...] | None, str]:
-    """Make a camera of each set of intrinsics that there is.
+) -> tuple[dict[str, Camera], list[str | None], str]:
+    """Make a camera of each distinct set of intrinsics.
 
     Args:
         intrinsics: of N frames, by :data:`KEYS`.
         images: their files, all there.
-        file: where they are told, for messages.
+        file: that holds them, for messages.
 
     Returns:
-        Cameras by name, N names or None where nothing is told of any camera, and what was decided.
+        Cameras by name; the name of each frame's camera, None where the file has no focal lengths; what was decided.
 
     Raises:
-        InputError: for a camera that is none, is told of some frames alone, or is not of these images.
+        InputError: for intrinsics that no camera has, that are missing for some frames, or are of another image size.
     """
-    told = [any(key in each for key in ("fl_x", "camera_angle_x")) for each in intrinsics]
-    if not any(told):
-        return {}, None, "none: the file tells no focal length"
-    if not all(told):
-        raise InputError(f"{file}: tells a focal length of some frames, not of {images[told.index(False)]}; add it")
+    has_focal = [any(key in each for key in ("fl_x", "camera_angle_x")) for each in intrinsics]
+    if not any(has_focal):
+        return {}, [None] * len(images), "none: the file tells no focal length"
+    if not all(has_focal):
+        raise InputError(
+            f"{file}: tells a focal length of some frames, not of {images[has_focal.index(False)]}; add it"
+        )
     size = _first_size(images)
-    keys = [tuple(sorted((key, repr(value)) for key, value in each.items())) for each in intrinsics]
+    keys = [repr(sorted(each.items())) for each in intrinsics]
     names = {key: f"camera-{count}" for count, key in enumerate(dict.fromkeys(keys), start=1)}
     cameras: dict[str, Camera] = {}
-    for key, told_of, image in zip(keys, intrinsics, images, strict=True):
+    for key, each, image in zip(keys, intrinsics, images, strict=True):
         if names[key] not in cameras:
-            cameras[names[key]] = _camera(told_of, size, f"{file}: camera of {image.name}")
-    return cameras, tuple(names[key] for key in keys), _said(cameras, intrinsics[0], size)
+            cameras[names[key]] = _camera(each, size, f"{file}: camera of {image.name}")
+    return cameras, [names[key] for key in keys], _said(cameras, intrinsics[0], size)
 
 
 def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
@@ -81,7 +82,7 @@ def _camera(told: Mapping[str, Any], size: tuple[int, int], where: str) -> Camer
     focal_px = (focal[0], focal[1]) if focal[0] and focal[1] else (focal[0] or focal[1],) * 2
     centre = [number(told, key, where) for key in ("cx", "cy")]
     centre_px = [side / 2 if at is None else at for at, side in zip(centre, sides, strict=True)]
-    if not all(1 <= side <= _MOST_PIXELS for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
+    if not all(1 <= side <= LARGEST_SIDE_PX for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
         raise InputError(f"{where}: {sides[0]:g}x{sides[1]:g} pixels, focal length {focal_px[0]:g}: correct it")
     if not all(-side < at < 2 * side for at, side in zip(centre_px, sides, strict=True)):
         raise InputError(f"{where}: its centre {centre_px} is far outside of the image; correct it")
@@ -91,7 +92,7 @@ def _camera(told: Mapping[str, Any], size: tuple[int, int], where: str) -> Camer
         width,
         height,
         (focal_px[0] * width / sides[0], focal_px[1] * height / sides[1]),
-        (centre_px[0] * width / sides[0] - 0.5, centre_px[1] * height / sides[1] - 0.5),
+        (centre_px[0] * width / sides[0] - CORNER_PX, centre_px[1] * height / sides[1] - CORNER_PX),
     )
     return _with_lens(camera, told, where)
 

@@ -1,9 +1,9 @@
-"""Text, JSON, numbers and names from a source that is not trusted: sound, or refused in one line."""
+"""Text, JSON, numbers and file names of an untrusted source: checked, or refused with a one-line ``InputError``."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,20 +132,20 @@ def array_of(value: Any, shape: tuple[int | None, ...], name: str, path: Path) -
     return array
 
 
-def inside(folder: Path, name: str, where: str) -> Path:
+def inside(folder: Path, name: Any, where: str) -> Path:
     """The path of a file that a source names by its place in a folder; whether it is there is not asked.
 
     Args:
         folder: of the source.
-        name: relative path, with either kind of slash.
+        name: relative path, with either kind of slash; in JSON it may be anything.
         where: what names it, for messages.
 
     Raises:
         InputError: for a name that leads out of the folder, or is none that a file can have.
     """
-    path = path_inside(folder, name)
+    path = path_inside(folder, name) if isinstance(name, str) else None
     if path is None:
-        raise InputError(f"{where}: names {name[:60]!r}, which is no file inside of {folder}; correct the name")
+        raise InputError(f"{where}: names {str(name)[:60]!r}, which is no file inside of {folder}; correct the name")
     return path
 
 
@@ -166,6 +166,11 @@ def pictures(folder: Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"{folder}: cannot be read ({error.strerror}); make it readable") from None
     return sorted((p for p in files if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural)
+
+
+def pictures_beside(images: Iterable[Path]) -> list[Path]:
+    """All pictures in the folders that images are in, as :func:`pictures`."""
+    return [picture for folder in dict.fromkeys(image.parent for image in images) for picture in pictures(folder)]
 
 
 def first_with_pictures(folders: Sequence[Path]) -> Path:

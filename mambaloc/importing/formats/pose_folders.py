@@ -18,7 +18,7 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.images import read_image
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import Matrices, Posed, gathered, pinhole, rigid
+from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
     array_of,
     as_numbers,
@@ -62,13 +62,13 @@ def read_scannet(source: Path) -> Capture:
     tracked = [file for file, matrix in matrices.items() if np.isfinite(matrix).all()]
     if not tracked:
         raise InputError(f"{folder / 'pose'}: all {len(files)} poses are infinite or NaN; record again")
-    world_from_cam = rigid(np.stack([matrices[file] for file in tracked]), lambda row: str(tracked[row]))
+    world_from_cam = validate_se3(np.stack([matrices[file] for file in tracked]), lambda row: str(tracked[row]))
     camera = _scannet_camera(folder / "intrinsic" / "intrinsic_color.txt", next(iter(images.values())))
     name = folder_name(source)
     present = [
         (images[file.stem], pose) for file, pose in zip(tracked, world_from_cam, strict=True) if file.stem in images
     ]
-    return gathered(
+    return build_capture(
         "scannet",
         source,
         [Posed(image, name, pose, None if camera is None else "color") for image, pose in present],
@@ -92,7 +92,7 @@ def read_replica(source: Path) -> Capture:
         InputError: for a file that is missing or damaged.
     """
     table = read_table(source / "traj.txt", 16, _MATRIX)
-    world_from_cam = rigid(table.numbers.reshape(-1, 4, 4), table.where)
+    world_from_cam = validate_se3(table.numbers.reshape(-1, 4, 4), table.where)
     images = [image for image in pictures(source / "results") if image.name.startswith("frame")]
     numbered = {number_of(image): image for image in images}
     camera = _replica_camera(source)
@@ -104,7 +104,7 @@ def read_replica(source: Path) -> Capture:
         else:
             missing.append(f"results/frame{row:06d}")
     cameras = {} if camera is None else {"frame": camera}
-    return gathered(
+    return build_capture(
         "replica", source, posed, unit="metre", choices=_CHOICES, cameras=cameras, missing=missing, beside=images
     )
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mambaloc.errors import InputError
 from mambaloc.images import PICTURES
 from mambaloc.importing.capture import Capture, Unit
-from mambaloc.importing.formats.builder import Posed, from_quaternions, gathered
+from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
 from mambaloc.importing.formats.parsing import (
     Table,
     as_numbers,
@@ -194,4 +194,4 @@ def _capture(
         rows = sorted(rows, key=lambda row: row[2] or 0.0)
     sequence = folder_name(source)
     posed = [Posed(image, sequence, world_from_cam[row], time_s=time_s) for image, row, time_s in rows]
-    return gathered(kind, source, posed, unit=unit, choices=choices, missing=missing, beside=beside)
+    return build_capture(kind, source, posed, unit=unit, choices=choices, missing=missing, beside=beside)

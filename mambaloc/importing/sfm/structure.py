@@ -27,7 +27,7 @@ from mambaloc.importing.formats.colmap import read_colmap
 from mambaloc.importing.formats.parsing import first_with_pictures, folder_name, pictures
 from mambaloc.importing.sfm.frame_choice import choose_frames
 from mambaloc.importing.sfm.reconstruction import NEIGHBOURS, find_features, match_features, place_images, quiet_colmap
-from mambaloc.runtime.sources import SourceFrame, frames_of
+from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
 from mambaloc.user_cache import made_once
 
 FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
@@ -128,7 +128,7 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
 def _of_pictures(folder: Path) -> tuple[Iterator[SourceFrame], int]:
     """A folder's pictures in natural order, as frames."""
     paths = pictures(folder)
-    return (SourceFrame(str(at), float(at), read_image(path)) for at, path in enumerate(paths)), len(paths)
+    return (SourceFrame(str(at), at / PICTURES_HZ, read_image(path)) for at, path in enumerate(paths)), len(paths)
 
 
 def _write(frames: Iterable[SourceFrame], folder: Path) -> tuple[dict[str, float], set[tuple[int, ...]]]:

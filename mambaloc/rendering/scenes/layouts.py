@@ -20,12 +20,12 @@ from rich.console import Console
 from rich.progress import track
 
 from mambaloc.errors import InputError
-from mambaloc.rendering.poses import quaternion_from_matrix
 from mambaloc.rendering.quads import Image, Room
 from mambaloc.rendering.renderer import default_intrinsics, render, sensor
 from mambaloc.rendering.room import room_around
 from mambaloc.rendering.scenes.shots import Shot
 from mambaloc.rendering.scenes.tracks import write_nvm
+from mambaloc.runtime.rotations import quaternion_from_matrix
 
 GENERATOR_VERSION = 1
 """Raised with every change that renders other pictures."""

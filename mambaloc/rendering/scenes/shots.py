@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.rendering.poses import matrix_from_quaternion
 from mambaloc.rendering.quads import Vectors
+from mambaloc.runtime.rotations import matrix_from_quaternion
 
 Layout = Literal["7scenes", "cambridge"]
 FRAME_7SCENES = "seq-{sequence:02d}/frame-{frame:06d}.color.png"

@@ -8,9 +8,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.rendering.poses import quaternion_from_matrix
 from mambaloc.rendering.quads import Vectors
 from mambaloc.rendering.scenes.shots import Shot
+from mambaloc.runtime.rotations import quaternion_from_matrix
 
 _POINTS = 4000  # in all: about as many in a picture as a real model has
 _DEPTH_TOLERANCE = 0.02  # of the depth; the nearest pixel's is compared, which on a slanting plane is another

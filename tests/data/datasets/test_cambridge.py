@@ -126,7 +126,7 @@ def expect_rejection(folder: Path, place: str, rule: str) -> None:
     assert str(bad.rejected[0].path) == place
 
 
-@pytest.mark.parametrize("scale", [2.0, 0.9, 1.002])
+@pytest.mark.parametrize("scale", [2.0, 0.9, 1.002, 1e200])
 def test_quaternion_of_another_length_is_normalised_and_counted(tmp_path, scale):
     wxyz = np.array([0.1, -0.7, 0.5, 0.5]) / np.linalg.norm([0.1, -0.7, 0.5, 0.5])
     write_list(tmp_path, [f"seq1/a.png 1 2 3 {' '.join(map(str, scale * wxyz))}", f"seq1/b.png {GOOD}"])

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.capture import COLUMNS, focal_ratio_of, is_captured, read_rows, read_split
-from mambaloc.data.datasets.registry import locate, scene_folder
-from mambaloc.data.download.origins import licence_of_weights
+from mambaloc.data.datasets.registry import licence_of_weights, locate, scene_folder
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
 from mambaloc.export import contract_of
@@ -291,7 +290,7 @@ def test_crops_turn_by_the_scenes_own_focal_length(scene, tmp_path):
         data = module(scene, tmp_path, validation="none", batch_size=6, **values)
         data.setup("fit")
         data.trainer = type("Trainer", (), {"training": True, "current_epoch": 0, "world_size": 1, "global_rank": 0})()
-        batch = data._loaded["train"].data.__getitems__(list(range(6)))
+        batch = data.scene.parts["train"].data.__getitems__(list(range(6)))
         return data.on_after_batch_transfer(batch, 0).quaternion, batch.quaternion
 
     asked, plain = turned(focal_ratio="scene")

@@ -104,6 +104,7 @@ def test_record3d_frames_are_found_by_their_number(record3d, recording):
         ({"w": 0}, "must have a size"),
         ({"w": 64.5}, "must have a size"),
         ({"w": 1e30}, "must have a size"),
+        ({"w": 32767}, "at most 32766 pixels a side"),
         ({"h": None}, "'w, h' must be 2 finite numbers"),
         ({"perFrameIntrinsicCoeffs": [[1, 2, 3, 4]]}, "'perFrameIntrinsicCoeffs' must be 6 x 4 finite numbers"),
         ({"frameTimestamps": [1.0]}, "'frameTimestamps' must be 6 finite numbers"),

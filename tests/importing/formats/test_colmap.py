@@ -128,6 +128,7 @@ def test_a_cut_file_is_named_in_one_line(recording, tmp_path, refused, file, sha
         ("cameras.txt", " 60 33", " nan 33", ""),
         ("cameras.txt", " 60 33", " 0 33", "without a size or a finite, positive focal length"),
         ("cameras.txt", " 64 48 ", " 0 48 ", "without a size or a finite, positive focal length"),
+        ("cameras.txt", " 64 48 ", " 40000 48 ", "a camera has 40000x48 pixels, more than 32766 a side"),
         ("cameras.txt", "SIMPLE_RADIAL", "ROUND", "is no COLMAP model that pycolmap can read"),
     ],
 )

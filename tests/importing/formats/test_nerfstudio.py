@@ -201,13 +201,14 @@ BAD = {
     "is no JSON": lambda told: "{",
     "is no JSON ": lambda told: "[" * 100_000,
     "has no list of 'frames'": lambda told: {},
-    "has no list of 'frames' ": lambda told: [],
-    "has no list of 'frames'  ": top(frames=[1]),
-    "frame 1: file_path: 'None' is no path inside": frame("file_path", None),
-    "frame 1: file_path: '../../secret.png' is no path inside": frame("file_path", "../../secret.png"),
-    "frame 1: file_path: '/etc/passwd' is no path inside": frame("file_path", "/etc/passwd"),
-    "frame 1: file_path: 'C:\\\\a.png' is no path inside": frame("file_path", "C:\\a.png"),
-    "lists images/a_2.png twice": frame("file_path", "images/a_2.png"),
+    "is no JSON object; it holds 'frames'": lambda told: [],
+    "has no list of 'frames' ": top(frames=[1]),
+    "frame 1: file_path: names 'None', which is no file inside of": frame("file_path", None),
+    "frame 1: file_path: names '../../secret.png', which is no file inside of": frame("file_path", "../../secret.png"),
+    "frame 1: file_path: names '/etc/passwd', which is no file inside of": frame("file_path", "/etc/passwd"),
+    "frame 1: file_path: names 'C:\\\\a.png', which is no file inside of": frame("file_path", "C:\\a.png"),
+    "aaaaaa', which is no file inside of": frame("file_path", "a" * 253),  # too long with a suffix
+    "images/a_2.png more than one pose; remove all but one": frame("file_path", "images/a_2.png"),
     "frame 1: transform_matrix is no 4x4 or 3x4 matrix": frame("transform_matrix", [[1, 2], [3, 4]]),
     "frame 1: transform_matrix is no 4x4 or 3x4 matrix ": frame("transform_matrix", "none"),
     "frame 1: transform_matrix is no 4x4 or 3x4 matrix  ": frame("transform_matrix", [["a"] * 4] * 4),
@@ -219,6 +220,7 @@ BAD = {
     "camera of a_1.png: k1 is 'True', no finite number": frame("k1", True),
     "focal length -5: correct it": frame("fl_x", -5),
     "1e+09x24 pixels": frame("w", 1e9),
+    "32767x24 pixels": frame("w", 32767),
     "is far outside of the image": frame("cx", 1e6),
     "is of 64x24 images, and the first one that is there has 32x24": frame("w", 64),
     "camera_angle_x is 4": lambda told: top(camera_angle_x=4)(without(told, "fl_x", "fl_y")),
@@ -228,7 +230,7 @@ BAD = {
     "applied_transform is no rotation and shift": top(applied_transform=[[2, 0, 0, 0]] * 3),
     "applied_transform is no 4x4": top(applied_transform="z up"),
     "train_filenames is no list": top(train_filenames=3),
-    "train_filenames: '../a' is no path inside": top(train_filenames=["../a"]),
+    "train_filenames: names '../a', which is no file inside of": top(train_filenames=["../a"]),
 }
 
 
@@ -246,7 +248,14 @@ def test_bad_input_is_named_in_one_line(write, tmp_path, message, change):
 
 def test_no_image_is_there(write, tmp_path):
     write(absent=("images/a_1.png", "images/a_2.png"))
-    with pytest.raises(InputError, match="none of its 2 images is there"):
+    with pytest.raises(InputError, match=r"no image with a pose; 2 are named and missing, such as 'images/a_1\.png'"):
+        read_capture(tmp_path)
+
+
+def test_more_frames_than_a_scene_may_have(write, tmp_path, monkeypatch):
+    write()
+    monkeypatch.setattr("mambaloc.importing.formats.builder.MOST_FRAMES", 1)
+    with pytest.raises(InputError, match="lists 2 frames, more than 1; keep fewer"):
         read_capture(tmp_path)
 
 

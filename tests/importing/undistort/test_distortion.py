@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from mambaloc.errors import InputError
+from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens, pinhole_of, sampled_at
 
@@ -86,6 +87,11 @@ def test_pixels_of_a_fisheye_come_from_where_opencv_takes_them():
         matrix_of(lens), np.array(coefficients), None, matrix_of(pinhole), (WIDTH, HEIGHT), cv2.CV_32FC1
     )
     np.testing.assert_allclose(sampled_at(lens, pinhole), expected, atol=1e-3)
+
+
+def test_the_longest_image_can_be_undistorted():
+    row, where = np.zeros((1, LARGEST_SIDE_PX, 3), np.uint8), np.zeros((1, LARGEST_SIDE_PX), np.float32)
+    assert cv2.remap(row, where, where, cv2.INTER_LINEAR).shape == row.shape
 
 
 def test_a_pinhole_stays_itself():

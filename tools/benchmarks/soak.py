@@ -1,7 +1,11 @@
-"""Whether a long training stays as it began: memory, open files and threads, sampled while a recipe trains."""
+"""Sample memory, open files and threads while a recipe trains, to see whether a long training stays as it began.
+
+python tools/benchmarks/soak.py RECIPE.yaml [OVERLAY.yaml ...] [--steps N] [--out FOLDER]
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -17,8 +21,10 @@ import torch
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from mambaloc import provenance
 from mambaloc.benchmark.footprint import STATUS, said_of
 from mambaloc.benchmark.report import new_table
+from mambaloc.console import exits_cleanly, quieten
 from mambaloc.errors import InputError
 from mambaloc.files import writing
 from mambaloc.viz.curves import COLORS, finish
@@ -27,7 +33,7 @@ from mambaloc.viz.trajectory import write_png
 _SAMPLES = 200
 _FEWEST = 10  # steps
 _WARM_UP = 0.2  # of the steps: allocators and caches fill, first validation and first checkpoint
-_TRAIN = "from mambaloc.cli import main; main()"
+_TRAIN = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from mambaloc.cli import main; main()"
 
 SHOWN = {
     "private_mib": "memory of its own (MiB)",
@@ -56,6 +62,21 @@ class Sample:
     device_mib: float
     files: int
     threads: int
+
+
+@exits_cleanly
+def main() -> None:
+    """Train, print and draw."""
+    quieten()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recipes", type=Path, nargs="+", help="a recipe, and overlays")
+    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("--out", type=Path, default=Path("runs/soak"), help="folder that is not there yet")
+    args = parser.parse_args()
+    samples = measure_soak(args.recipes, args.steps, args.out)
+    print_soak(samples, provenance.machine())
+    draw_soak(samples, args.out / "soak.png", f"{args.recipes[0].stem}, {args.steps} steps")
+    print(f"{args.out}: soak.png, samples.jsonl, train.log, run/")
 
 
 class ResourceWatch(L.Callback):
@@ -114,7 +135,7 @@ def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]
     command = [
         *(sys.executable, "-c", _TRAIN, *map(str, recipes), "--trainer.default_root_dir", str(out / "run")),
         *("--trainer.max_epochs", "-1", "--trainer.max_steps", str(steps), "--early_stopping.patience", "0"),
-        *(f"{watch}+=mambaloc.benchmark.soak.ResourceWatch", f"{watch}.out={samples}"),
+        *(f"{watch}+=soak.ResourceWatch", f"{watch}.out={samples}"),
         f"{watch}.every_n_steps={max(1, steps // _SAMPLES)}",
     ]
     with Console(stderr=True).status(f"training {steps} steps"), log.open("w", encoding="utf-8") as said:
@@ -122,7 +143,12 @@ def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]
     if ended.returncode:
         last = (log.read_text(encoding="utf-8").strip().splitlines() or ["it said nothing"])[-1]
         raise InputError(f"{recipes[0]}: its training ended with {ended.returncode} ({last}); see {log}")
-    return [Sample(**json.loads(line)) for line in samples.read_text(encoding="utf-8").splitlines()]
+    return read_samples(samples)
+
+
+def read_samples(path: Path) -> list[Sample]:
+    """Read what a :class:`ResourceWatch` wrote."""
+    return [Sample(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def growth(samples: list[Sample], of: str) -> tuple[float, float]:
@@ -160,3 +186,7 @@ def draw_soak(samples: list[Sample], path: Path, title: str) -> None:
     figure.suptitle(title, fontsize=11)
     with writing(path):
         write_png(figure, path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""What :mod:`mambaloc.benchmark.uncertainty` found: tables in the terminal, coverage and sparsification drawn, JSON."""
+"""What :mod:`uncertainty_methods` measured: tables in the terminal, coverage and sparsification drawn, JSON."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 from torch import Tensor
-
-from mambaloc.benchmark.report import new_table
-from mambaloc.benchmark.uncertainty import (
+from uncertainty_methods import (
     LEVELS,
     REJECTED,
     Certainty,
@@ -25,6 +23,8 @@ from mambaloc.benchmark.uncertainty import (
     rank_correlation,
     told_apart,
 )
+
+from mambaloc.benchmark.report import new_table
 from mambaloc.files import whole_file, writing
 from mambaloc.viz.curves import COLORS, finish
 from mambaloc.viz.trajectory import write_png

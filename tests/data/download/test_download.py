@@ -22,14 +22,17 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from mambaloc.data.download import Archive, Source, describe_sources, download, how_to_get
+from mambaloc.data.datasets.cambridge import SOURCE as CAMBRIDGE
+from mambaloc.data.datasets.dataset import Archive, Source
+from mambaloc.data.datasets.registry import SOURCES, describe_sources, how_to_get
+from mambaloc.data.datasets.seven_scenes import SOURCE as SEVENSCENES
+from mambaloc.data.download import download
 from mambaloc.data.download import scene as download_module
 from mambaloc.data.download.archives import require_space, unpack
 from mambaloc.data.download.fetch import fetch
-from mambaloc.data.download.origins import CAMBRIDGE, SEVENSCENES, SOURCES
 from mambaloc.errors import InputError
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 
 
 @dataclass
@@ -377,6 +380,14 @@ def test_a_scene_that_lacks_a_sequence_is_not_touched(tmp_path: Path) -> None:
         download("7scenes", "heads", tmp_path)
 
 
+def test_a_malformed_split_file_is_named_as_the_reader_names_it(tmp_path: Path) -> None:
+    (tmp_path / "heads/seq-01").mkdir(parents=True)
+    for split in SEVENSCENES.splits:
+        (tmp_path / "heads" / split).write_text("sequence1\nseq-01\n")
+    with pytest.raises(InputError, match=r"TrainSplit\.txt, line 2: 'seq-01' is no 'sequenceN'"):
+        download("7scenes", "heads", tmp_path)
+
+
 def test_two_processes_do_not_get_one_scene(server: Server, tmp_path: Path) -> None:
     with FileLock(tmp_path / ".heads.lock"), pytest.raises(InputError, match="another process is getting this scene"):
         get(server.source(HEADS), tmp_path)
@@ -460,6 +471,12 @@ def test_the_table_of_addresses_is_sane() -> None:
     assert all(archive.sha256 is None or re.fullmatch("[0-9a-f]{64}", archive.sha256) for archive in archives)
     for word in ("7scenes", "CC BY-NC-SA 2.0 UK", "heads", "1.0 GB", "KingsCollege", CAMBRIDGE.page):
         assert word in describe_sources()
+
+
+def test_downloading_needs_no_torch() -> None:
+    told = "import sys, mambaloc.data.download; print({'torch', 'lightning'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", told], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
 
 
 def test_the_tool_ends_in_one_line_and_code_2(tmp_path: Path) -> None:

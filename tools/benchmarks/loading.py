@@ -1,7 +1,11 @@
-"""Frames from the decode-once cache against decoding every frame every epoch, on one core."""
+"""Measure frames from the decode-once cache against decoding every frame every epoch, on one core.
+
+python tools/benchmarks/loading.py [--dataset NAME] [--root FOLDER] [--scene NAME]
+"""
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +16,9 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
+from mambaloc import provenance
 from mambaloc.benchmark.reference import DecodedFrames
+from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.data.augmentation import augment, augmentations, draw_uniforms
 from mambaloc.memory import keep_freed_memory
@@ -31,6 +37,17 @@ class LoadingRates:
     def ratio(self) -> float:
         """How many times faster the cache is, by medians."""
         return median(self.cached) / median(self.decoded)
+
+
+@exits_cleanly
+def main() -> None:
+    """Measure a scene and print."""
+    quieten()
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
+        parser.add_argument(name, default=default)
+    args = parser.parse_args()
+    print_loading(measure_loading(PoseDataModule(args.dataset, args.root, args.scene)), provenance.machine())
 
 
 def measure_loading(data: PoseDataModule, batches: int = 32, repetitions: int = 5) -> LoadingRates:
@@ -63,6 +80,13 @@ def measure_loading(data: PoseDataModule, batches: int = 32, repetitions: int = 
     return LoadingRates(**rates)
 
 
+def print_loading(rates: LoadingRates, machine: str) -> None:
+    """Print images per second, and their ratio."""
+    for name, figures in (("decode-once cache", rates.cached), ("decode every epoch", rates.decoded)):
+        print(f"{name:20}{median(figures):8.0f} images/s on one core  ({min(figures):.0f} to {max(figures):.0f})")
+    print(f"ratio {rates.ratio:.1f}   {machine}")
+
+
 def _images_per_second(load: Callable[[list[int]], Tensor], batch_size: int, batches: int, frames: int) -> float:
     order = torch.randperm(frames, generator=torch.Generator().manual_seed(0)).tolist()
     start = time.perf_counter()
@@ -91,3 +115,7 @@ def _decoded(data: PoseDataModule) -> Callable[[list[int]], Tensor]:
         return torch.stack([frames[i][0] for i in indices])
 
     return load
+
+
+if __name__ == "__main__":
+    main()

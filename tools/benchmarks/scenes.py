@@ -1,7 +1,11 @@
-"""What a scene costs before the first step: reading its labels, decoding it once, opening it again, memory and disk."""
+"""Measure what scenes cost before the first step: reading labels, decoding once, opening again, memory and disk.
+
+python tools/benchmarks/scenes.py FOLDER [SCENE ...] [--dataset NAME] [--short-side PIXELS]
+"""
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +15,10 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 from rich.progress import track
 
+from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process, peak_bytes
+from mambaloc.benchmark.report import new_table
+from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.registry import DATASETS, scene_folder
 from mambaloc.data.frames import BadFrames, Split
@@ -57,6 +64,19 @@ class SceneCost:
         return self.listed["train"], self.listed["test"]
 
 
+@exits_cleanly
+def main() -> None:
+    """Measure scenes and print."""
+    quieten()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("root", type=Path, help="folder that holds them")
+    parser.add_argument("scenes", nargs="*", help="names; every official one that is there unless given")
+    parser.add_argument("--dataset", default="7scenes")
+    parser.add_argument("--short-side", type=int, default=256, help="what images are resized to, in pixels")
+    args = parser.parse_args()
+    print_scenes(measure_scenes(args.dataset, args.root, args.scenes, args.short_side), provenance.machine())
+
+
 def measure_scenes(dataset: str, root: Path, scenes: Sequence[str], short_side: int = 256) -> list[SceneCost]:
     """Load scenes, one after another, each into a cache that is removed afterwards.
 
@@ -81,6 +101,31 @@ def measure_scenes(dataset: str, root: Path, scenes: Sequence[str], short_side: 
         with TemporaryDirectory(dir=kept) as cache:
             found.append(in_a_process(_measure, dataset, root, name, short_side, cache))
     return found
+
+
+def print_scenes(scenes: Sequence[SceneCost], machine: str) -> None:
+    """Print a row a scene: frames, seconds, memory, disk; then which are the benchmark's, and which are rendered."""
+    names = ("scene", "frames", "read s", "decode s", "open s", "memory MiB", "disk MiB")
+    table = new_table("Scenes loaded whole: train + test frames, images + cache on disk", *names)
+    for each in scenes:
+        train, test = each.counts
+        seconds = (f"{s:.1f}" for s in (each.read_s, each.build_s, each.open_s))
+        memory = f"{(each.peak_bytes - each.start_bytes) / 2**20:.0f}"
+        disk = f"{each.image_bytes / 2**20:.0f} + {each.cache_bytes / 2**20:.0f}"
+        table.add_row(each.scene, f"{train} + {test}", *seconds, memory, disk)
+    console = Console(highlight=False)
+    console.print(table)
+    for said, which in {
+        "of the benchmark's size": [each.scene for each in scenes if each.counts == each.official],
+        "of another size than the benchmark's": [each.scene for each in scenes if each.counts != each.official],
+        "rendered, no real pictures": [each.scene for each in scenes if each.rendered],
+        "with bad frames": [f"{each.scene} ({each.skipped})" for each in scenes if each.skipped],
+    }.items():
+        if which:
+            console.print(f"{said}: {', '.join(which)}", soft_wrap=True)
+    console.print("decode: once, ever; open: from the cache, each run. Memory: the most while loading, the")
+    console.print("cache's mapped pages included, less that of the process before it.")
+    console.print(machine, soft_wrap=True)
 
 
 def _measure(dataset: str, root: Path, scene: str, short_side: int, cache: str) -> SceneCost:
@@ -118,3 +163,7 @@ def _measure(dataset: str, root: Path, scene: str, short_side: int, cache: str) 
         sum(path.stat().st_size for part in ("train", "test") for path in data.frames(part).image_paths),
         sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file()),
     )
+
+
+if __name__ == "__main__":
+    main()

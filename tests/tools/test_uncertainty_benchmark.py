@@ -8,14 +8,21 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import mannwhitneyu, spearmanr
+from uncertainty_methods import (
+    LEVELS,
+    change_by_rejection,
+    measure_certainty,
+    pose_spread,
+    rank_correlation,
+    told_apart,
+)
+from uncertainty_report import print_certainty, write_certainty
 
-from mambaloc.benchmark import measure_certainty, print_certainty, write_certainty
-from mambaloc.benchmark.uncertainty import LEVELS, change_by_rejection, pose_spread, rank_correlation, told_apart
-from mambaloc.cli import main
+from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical
+from mambaloc.models import create_model
 from mambaloc.types import PosePrediction
-from mambaloc.zoo.bundles import load_with_data
 
 
 def test_figures_against_scipy():
@@ -47,12 +54,19 @@ def test_spreads_by_hand():
     assert degrees.item() == pytest.approx(10, abs=1e-3)
 
 
-@pytest.fixture
-def systems(tiny_recipe, tmp_path):
-    for seed in ("0", "1"):
-        options = ["--seed_everything", seed, "--trainer.max_epochs", "1"]
-        main([str(tiny_recipe), *options, "--trainer.default_root_dir", str(tmp_path / seed)])
-    return [load_with_data(str(tmp_path / seed / "checkpoints/last.ckpt")) for seed in ("0", "1")]
+@pytest.fixture(scope="module")
+def systems(scenes):
+    """Two systems as they start, which say what they would be trained on."""
+    small = {"dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "head_hidden": 16}
+    found = []
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        data = PoseDataModule("7scenes", str(scenes), "heads", 32, 36, validation="sequences", batch_size=4)
+        data.setup("fit")
+        system = create_model("mambaloc", backbone="test_efficientnet", image_size=32, **small)
+        system.provenance = {"data": data.describe()}
+        found.append((system, data))
+    return found
 
 
 @pytest.fixture
@@ -65,7 +79,6 @@ def elsewhere(tmp_path):
     return folder
 
 
-@pytest.mark.slow
 def test_all_of_it_on_a_tiny_scene(systems, elsewhere, tmp_path, capsys):
     found = measure_certainty(dict(zip("ab", systems, strict=True)), elsewhere)
     for each in found:
@@ -91,7 +104,6 @@ def test_all_of_it_on_a_tiny_scene(systems, elsewhere, tmp_path, capsys):
     assert "of 3 pictures of another place" in said
 
 
-@pytest.mark.slow
 def test_one_checkpoint_and_no_other_place(systems, tmp_path, capsys):
     found = measure_certainty({"a": systems[0]})
     assert len(found[0].ways) == 3
@@ -102,3 +114,9 @@ def test_one_checkpoint_and_no_other_place(systems, tmp_path, capsys):
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match=r"--elsewhere .*none: holds no \.png"):
         measure_certainty({"a": systems[0]}, tmp_path / "none")
+
+
+def test_a_checkpoint_from_a_shell(trained, tmp_path, tool, capsys):
+    tool("benchmarks/uncertainty", trained / "checkpoints/last.ckpt", "--out", tmp_path / "out")
+    assert "shifted crops" in capsys.readouterr().out
+    assert (tmp_path / "out/uncertainty.json").is_file()

@@ -1,0 +1,190 @@
+"""A scene on disk, as a recipe asks for it: located, read, held out, thinned, decoded, with points, and described."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mambaloc import provenance
+from mambaloc.data.datasets.capture import CAPTURE, describe_capture, focal_ratio_of
+from mambaloc.data.datasets.registry import DATASETS, is_official, is_rendered, locate, scene_folder
+from mambaloc.data.frame_dataset import CachedFrames, LoadedSplit, describe_points, load_split
+from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
+from mambaloc.data.points import read_points
+from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
+from mambaloc.errors import InputError
+from mambaloc.types import height_and_width
+
+Read = tuple[Frames, BadFrames]
+"""Posed frames, not yet decoded, and what was left out of them."""
+
+
+@dataclass
+class Scene:
+    """One scene's training, validation and test frames.
+
+    Fields are the arguments of :class:`~mambaloc.data.PoseDataModule` of the same names. ``dataset``, ``root`` and
+    ``scene`` are changed to what they mean: see :func:`~mambaloc.data.datasets.registry.locate`.
+
+    Attributes:
+        crop: height and width that networks see, in pixels.
+        parts: what is loaded so far.
+
+    Raises:
+        InputError: for a number that is out of range.
+    """
+
+    dataset: str
+    root: str | None
+    scene: str
+    image_size: int | tuple[int, int]
+    short_side: int
+    validation: Validation
+    val_fraction: float
+    val_gap: int
+    val_sequences: list[str] | None
+    keep_every: int
+    keep_count: int | None
+    clip_length: int
+    clip_skip: int
+    points_per_frame: int
+    on_bad_frame: OnBadFrame
+    cache_dir: str | None
+
+    def __post_init__(self) -> None:
+        self.dataset, self.root, self.scene = locate(self.dataset, self.root, self.scene)
+        self.crop = height_and_width(self.image_size)
+        self.parts: dict[Split, LoadedSplit] = {}
+        self._listed: dict[str, int] = {}
+        if min(self.crop) > self.short_side:
+            raise InputError(
+                f"data.image_size {self.image_size}: larger than data.short_side {self.short_side}; enlarge that"
+            )
+        if self.points_per_frame < 0:
+            raise InputError(f"data.points_per_frame {self.points_per_frame}: must be 0 or more; 0 reads none")
+
+    @property
+    def folder(self) -> Path:
+        """The scene's folder.
+
+        Raises:
+            InputError: for an unknown dataset, or a scene that is not there, with how to get it.
+        """
+        return scene_folder(self.dataset, Path(self.root) if self.root else None, self.scene)
+
+    def focal_ratio(self) -> float | None:
+        """Focal length of its cameras over their images' width, where an imported scene knows it and has one for all.
+
+        Raises:
+            InputError: for a malformed file.
+        """
+        return focal_ratio_of(self.folder) if self.dataset == CAPTURE else None
+
+    def read(self, split: Split) -> Read:
+        """Read the poses of a whole split, without decoding an image.
+
+        Raises:
+            InputError: where there is none, or for a bad frame under ``on_bad_frame: error``.
+        """
+        bad = BadFrames(self.on_bad_frame)
+        folder = self.folder  # first of all: an unknown dataset is told here
+        frames = DATASETS[self.dataset].read_split(folder, split, bad)
+        self._listed[split] = len(frames) + len(bad.rejected)
+        return frames, bad
+
+    def choose(self) -> tuple[Read, Read | None, float]:
+        """Read the frames to train on and those to validate on, without decoding an image.
+
+        Returns:
+            Training frames, neither held out nor thinned away; validation frames, None under ``none`` and
+            ``test_set``; and how many training frames each that is kept stands for.
+
+        Raises:
+            InputError: as :meth:`read`, and where a part would be empty.
+        """
+        train, bad = self.read("train")
+        val = self._marked() if self.validation in ("auto", "marked") else None
+        if val is None and self.validation not in ("none", "test_set"):
+            how: Any = self.validation  # not "marked", which has found its frames or raised
+            rows = hold_out(train, how, self.val_fraction, self.val_gap, self.val_sequences)
+            train, val = train.select(rows[0]), (train.select(rows[1]), BadFrames(bad.policy))
+        kept = subsample(train, self.keep_every, self.keep_count)
+        return (train.select(kept), bad), val, len(train) / len(kept)
+
+    def load_training(self) -> None:
+        """Load the parts ``train`` and ``val``, unless they are; every process may, for one builds the frame cache.
+
+        Raises:
+            InputError: as :meth:`choose`, and for images or points that cannot be used.
+        """
+        if "train" not in self.parts:
+            train, val, thinned_by = self.choose()
+            if val is not None:
+                self.parts["val"] = self._with_points(self._decode(*val))
+            self.parts["train"] = self._in_clips(self._with_points(self._decode(*train)), thinned_by)
+        if self.validation == "test_set" and "val" not in self.parts:
+            self.load_test()
+            self.parts["val"] = self._with_points(self.parts["test"])
+
+    def load_test(self) -> None:
+        """Load the part ``test``, unless it is.
+
+        Raises:
+            InputError: as :meth:`read`, and for images that cannot be used.
+        """
+        if "test" not in self.parts:
+            self.parts["test"] = self._decode(*self.read("test"))
+
+    def describe(self) -> dict[str, Any]:
+        """Say which frames a number comes from: scene, counts, selection rule, what was left out and repaired."""
+        rendered = is_rendered(self.folder)
+        return {
+            "dataset": self.dataset,
+            "scene": self.folder.name,
+            "official_split": not rendered and is_official(self.dataset, self.scene, self._listed),
+            "rendered": rendered,
+            "listed_frames": dict(self._listed),
+            **{f"{part}_frames": len(loaded.data.frames) for part, loaded in self.parts.items()},
+            "fingerprints": {part: loaded.fingerprint for part, loaded in self.parts.items()},
+            "skipped": {part: loaded.bad.counts() for part, loaded in self.parts.items()},
+            "repaired": {part: len(loaded.bad.repaired) for part, loaded in self.parts.items()},
+            "validation": self.validation,
+            "keep_every": self.keep_every,
+            "keep_count": self.keep_count,
+            "clip_length": self.clip_length,
+            "clip_skip": self.clip_skip,
+            "image_size": list(self.crop),
+            "short_side": self.short_side,
+            **describe_points(self.parts),
+            **(describe_capture(self.folder) if self.dataset == CAPTURE else {}),
+        }
+
+    def _marked(self) -> Read | None:
+        """Frames that the scene marks for validation, and what was left out of them."""
+        if DATASETS[self.dataset].marks_validation:
+            frames, bad = self.read("val")
+            if len(frames):
+                return frames, bad
+        if self.validation == "marked":
+            raise InputError(f"data.validation marked: {self.folder} marks no frames as val; use auto, or none")
+        return None
+
+    def _decode(self, frames: Frames, bad: BadFrames) -> LoadedSplit:
+        return load_split(frames, bad, self.short_side, self.crop, self.cache_dir)
+
+    def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
+        """Add what each frame may see, of the frames that could be decoded."""
+        if self.points_per_frame == 0:
+            return loaded
+        data = loaded.data
+        points = read_points(self.folder, data.frames, self.points_per_frame, provenance.seed())
+        return replace(loaded, data=CachedFrames(data.frames, data.images, points))
+
+    def _in_clips(self, loaded: LoadedSplit, thinned_by: float) -> LoadedSplit:
+        """Make an item of each clip; neighbours of a thinned sequence lie farther apart already."""
+        if self.clip_length == 1:
+            return loaded
+        data = loaded.data
+        clips = clips_of(data.frames, self.clip_length, max(1, round(self.clip_skip / thinned_by)))
+        return replace(loaded, data=CachedFrames(data.frames, data.images, data.points, clips))

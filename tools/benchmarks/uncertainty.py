@@ -1,0 +1,34 @@
+"""Compare ways of telling how sure a pose is, on the test frames of trained systems of one scene.
+
+python tools/benchmarks/uncertainty.py CHECKPOINT ... [--elsewhere FOLDER] [--out FOLDER]
+"""
+
+import argparse
+from pathlib import Path
+
+from uncertainty_methods import measure_certainty
+from uncertainty_report import print_certainty, write_certainty
+
+from mambaloc import provenance
+from mambaloc.console import exits_cleanly, quieten
+from mambaloc.zoo.bundles import load_with_data
+
+
+@exits_cleanly
+def main() -> None:
+    """Measure, print and write."""
+    quieten()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("checkpoints", nargs="+", help="of one scene; several are also taken for an ensemble")
+    parser.add_argument("--elsewhere", type=Path, help="folder of pictures of another place")
+    parser.add_argument("--out", type=Path, default=Path("runs/uncertainty"), help="folder of the plot and the figures")
+    args = parser.parse_args()
+    systems = {checkpoint: load_with_data(checkpoint) for checkpoint in args.checkpoints}
+    found = measure_certainty(systems, args.elsewhere)
+    print_certainty(found, provenance.machine())
+    write_certainty(found, args.out, provenance.machine())
+    print(f"{args.out}: uncertainty.json, uncertainty.png")
+
+
+if __name__ == "__main__":
+    main()
