@@ -116,9 +116,9 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
 
 
 def _within(views: NDArray[np.bool_], most_bytes: int) -> Indices:
-    """Those points that most frames see, in their order, of which so many bytes have room."""
+    """Points in the order of how many frames see them, most first, as many as so many bytes have room for."""
     bytes_each = 12 + 128 + -(-views.shape[1] // 8)
-    return np.sort(np.argsort(-views.sum(axis=1), kind="stable")[: most_bytes // bytes_each])
+    return np.argsort(-views.sum(axis=1), kind="stable")[: most_bytes // bytes_each]
 
 
 def epipolar_px(width: int) -> float:

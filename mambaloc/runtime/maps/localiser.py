@@ -27,6 +27,7 @@ from mambaloc.runtime.rotations import quaternion_from_matrix
 
 Floats = NDArray[np.floating[Any]]
 
+_AT_ONCE = 2500  # points, of those that most frames see, which are matched without a pose
 _RATIO = 0.85
 _GUIDED_RATIO = 0.95
 _GUIDED_FARTHEST = 0.9  # of unit descriptors
@@ -63,8 +64,8 @@ class MapLocalisation:
 class MapLocaliser:
     """Localise pictures in a map, without torch and without a network.
 
-    All points are matched at once, RANSAC finds a pose, and every point is searched again around where that pose
-    projects it to.
+    The points that most frames see are matched at once, RANSAC finds a pose, and every point is searched again around
+    where that pose projects it to.
 
     Args:
         sparse_map: the map.
@@ -100,15 +101,14 @@ class MapLocaliser:
     def localise_features(self, features: Features) -> MapLocalisation:
         """Localise a picture whose keypoints are found already."""
         near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
-        similarity = features.descriptors @ self._descriptors.T
-        best, is_clear = unambiguous(similarity, _RATIO)
+        best, is_clear = unambiguous(features.descriptors @ self._descriptors[:_AT_ONCE].T, _RATIO)
         rng = np.random.default_rng(self.seed)
         pose = ransac_pose(self._points_m[best[is_clear]], features.rays[is_clear], near, rng)
         if pose is None:
             return _nowhere()
         scale = near  # of the refinement; finer where the matches are
         for window in _WINDOWS:
-            keypoints, points = self._search(features, similarity, pose, window * near)
+            keypoints, points = self._search(features, pose, window * near)
             if len(points) < 4:
                 return _nowhere()
             seen_m, rays = self._points_m[points], features.rays[keypoints]
@@ -120,7 +120,7 @@ class MapLocaliser:
         return MapLocalisation(pose.position_m, quaternion, inliers, inliers >= self.map.least_inliers, covariance)
 
     def _search(
-        self, features: Features, similarity_NP: NDArray[np.float32], pose: CameraPose, radius: float
+        self, features: Features, pose: CameraPose, radius: float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Match again what a pose projects near a keypoint: rows of keypoints and of points."""
         projected, _ = pose.project(self._points_m)
@@ -129,7 +129,9 @@ class MapLocaliser:
             inside = ((projected >= corners[0]) & (projected <= corners[1])).all(axis=1)
         visible = np.flatnonzero(inside & self._seen_around(pose))
         x, y = (features.rays.T[..., None] - projected[visible].T[:, None]).astype(np.float32)
-        nearby = np.where(x * x + y * y <= radius**2, similarity_NP.take(visible, axis=1), np.float32(-1))
+        nearby = np.where(
+            x * x + y * y <= radius**2, features.descriptors @ self._descriptors[visible].T, np.float32(-1)
+        )
         best, is_clear = unambiguous(nearby, _GUIDED_RATIO)
         keep = is_clear & mutual(nearby, best)
         rows = np.flatnonzero(keep)

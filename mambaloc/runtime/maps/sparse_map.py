@@ -36,7 +36,7 @@ _DAMAGE = (
 
 @dataclass(frozen=True)
 class SparseMap:
-    """Points triangulated from posed frames, each with the mean descriptor of its views.
+    """Points triangulated from posed frames, each with the mean descriptor of its views; the most seen come first.
 
     Shape:
         ``points_m`` (P, 3) float32, world frame, metres; ``descriptors`` (P, 128) uint8, RootSIFT, see
