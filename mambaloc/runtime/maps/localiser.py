@@ -34,6 +34,7 @@ _GUIDED_FARTHEST = 0.9  # of unit descriptors
 _NEAREST = 8  # key frames whose points are searched again
 _WINDOWS = (6.0, 2.0)  # radii of the guided rounds, in times of what is near
 _LEAST_SHARE = 0.1
+_MOST_DEVIATION = 0.03  # of the key frames' spread; wrong poses rest on few matches, or on matches in one corner
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,8 @@ class MapLocalisation:
         position_m: in the map's frame.
         quaternion: likewise.
         inliers: matches that agree with the pose.
-        is_accepted: whether they are enough to believe it.
+        is_accepted: whether to believe it: there are enough, and they fix the position to 3 % of the spread of the
+            map's key frames, one standard deviation in the worst direction.
         covariance: of the position in metres, then of the rotation in radians about the fixed axes of the world: the
             order and frame of ROS's PoseWithCovariance. It says how well the matches fix the pose; errors that the
             map's own poses share are not in it.
@@ -116,8 +118,9 @@ class MapLocaliser:
             off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
             scale = min(near, max(5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
         inliers = int((off <= near).sum())
-        quaternion = quaternion_from_matrix(pose.rotation)
-        return MapLocalisation(pose.position_m, quaternion, inliers, inliers >= self.map.least_inliers, covariance)
+        deviation_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])  # in the direction that is least sure
+        is_accepted = inliers >= self.map.least_inliers and bool(deviation_m <= _MOST_DEVIATION * self._unit_m)
+        return MapLocalisation(pose.position_m, quaternion_from_matrix(pose.rotation), inliers, is_accepted, covariance)
 
     def _search(
         self, features: Features, pose: CameraPose, radius: float
