@@ -32,8 +32,7 @@ from mambaloc.distillation import LitDistillation
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, print_table
 from mambaloc.files import read_yaml, writing
-from mambaloc.models import LitPoseRegressor, list_models
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models import Checkpoint, LitPoseRegressor, list_models
 from mambaloc.models.registry import model_class
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
@@ -100,7 +99,7 @@ class RecipeCLI(LightningCLI):
         """Refuse a checkpoint that is none before anything reads it."""
         super().parse_arguments(parser, args)
         if checkpoint := self.config[self.config["subcommand"]].get("ckpt_path"):
-            read_checkpoint(checkpoint)
+            Checkpoint.read(checkpoint)
 
     def _parse_ckpt_path(self) -> None:
         """Resume what the command says: Lightning would put the checkpoint's hyperparameters over the recipe's."""
@@ -153,7 +152,8 @@ class RecipeCLI(LightningCLI):
         found = [path for name in ("best", "last") if (path := run_dir / "checkpoints" / f"{name}.ckpt").is_file()]
         retrieval = self.config[self.subcommand].retrieval
         if results := [
-            evaluate_checkpoint(path, run_dir / "evaluation" / path.stem, with_retrieval=retrieval) for path in found
+            evaluate_checkpoint(Checkpoint.read(path), run_dir / "evaluation" / path.stem, with_retrieval=retrieval)
+            for path in found
         ]:
             print_table(results)
             print(f"wrote {run_dir}: evaluation/{found[0].stem}/trajectory.png, model.onnx, checkpoints, config.yaml")

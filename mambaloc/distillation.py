@@ -55,8 +55,8 @@ class Teacher:
     def __call__(self, image: Tensor) -> Answers:
         """Localise images, (B, 3, H, W) in 0..1."""
         network = self.system.to(image.device).network
-        branches = network.features(network.backbone(image))
-        prediction = network.head(*branches)
+        branches = network.forward_features(image)
+        prediction = network.forward_head(branches)
         return Answers(prediction.position_m, prediction.quaternion, torch.cat(branches, dim=-1))
 
 
@@ -159,15 +159,15 @@ class LitDistillation(LitStudent):
     def on_fit_start(self) -> None:
         """With ``cache_teacher``, ask it for every training frame."""
         if self.hparams["cache_teacher"]:
-            images = self.scene_for("cache_teacher").centred_images("train")
-            shown = track(images, "Asking the teacher", transient=True, disable=self.global_rank > 0)
-            answers = [self.teacher(image.to(self.device)) for image in shown]
+            batches = self.scene_for("cache_teacher").batches("train")
+            shown = track(batches, "Asking the teacher", transient=True, disable=self.global_rank > 0)
+            answers = [self.teacher(batch.image.to(self.device)) for batch in shown]
             self.answers = Answers(*(torch.cat(each) for each in zip(*answers, strict=True)))
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
         """Return the weighed sum of the terms."""
         latent_BD = self.network.latent(batch.image)
-        prediction = self.network.head(*self.network.branches(latent_BD))
+        prediction = self.network.forward_head(self.network.branches(latent_BD))
         answer = self.teacher(batch.image) if self.answers is None else self.answers.of(batch.index)
         terms = {
             "hard": lambda: self.loss(prediction, batch),

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from mambaloc.data import PoseDataModule
 from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
-from mambaloc.geometry import canonical, position_error_m, rotation_error_deg
+from mambaloc.metrics import PoseErrors
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork
 
@@ -140,7 +140,8 @@ def head_and_held_out(system: LitPoseRegressor, data: PoseDataModule) -> tuple[U
     """
     _check_held_out(system, data)
     network = copy.deepcopy(system.network).cpu().float().eval()
-    head = UncertaintyHead(seen_of(network, data.centred_images("train", _REFERENCES)))
+    rows = data.frames("train").evenly_spread(_REFERENCES)
+    head = UncertaintyHead(seen_of(network, (batch.image for batch in data.batches("train", rows))))
     return head, errors_by_distance(network, head, data, "val")
 
 
@@ -173,26 +174,19 @@ def errors_by_distance(
         data: set up for the part.
         part: ``val`` or ``test``.
     """
-    distances, positions_m, quaternions = [], [], []
-    for image in data.centred_images(part):
-        feats = network.backbone(image)
-        prediction = network.head(*network.features(feats))
+    errors, distances = PoseErrors(), []
+    for batch in data.batches(part):
+        feats = network.forward_backbone(batch.image)
+        errors.update(network.forward_head(network.features(feats)), batch)
         distances.append(head.distance(pooled(feats)))
-        positions_m.append(prediction.position_m)
-        quaternions.append(prediction.quaternion)
-    frames = data.frames(part)
-    true_m, true_q = (torch.from_numpy(each).float() for each in (frames.position_m, frames.quaternion))
-    return ErrorsByDistance(
-        torch.cat(distances),
-        position_error_m(torch.cat(positions_m), true_m),
-        rotation_error_deg(canonical(torch.cat(quaternions)), true_q),
-    )
+    table = errors.table()
+    return ErrorsByDistance(torch.cat(distances), table.position_error_m, table.rotation_error_deg)
 
 
 @torch.inference_mode()
 def seen_of(network: PoseNetwork, images: Iterable[Tensor]) -> Tensor:
     """What a network's backbone sees of images as wholes; batches of (B, 3, H, W) in 0..1 -> (N, D)."""
-    return torch.cat([pooled(network.backbone(image)) for image in images])
+    return torch.cat([pooled(network.forward_backbone(image)) for image in images])
 
 
 def pooled(feats: Tensor | list[Tensor]) -> Tensor:

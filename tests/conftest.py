@@ -101,8 +101,9 @@ def trained(made_once, scenes):
     def train(folder: Path) -> None:
         model = {"class_path": "LitMambaLoc", "init_args": TINY_MAMBALOC}
         recipe = write_recipe(folder / "recipe.yaml", scenes, model, {"validation": "sequences"}, max_epochs=3)
-        options = ["--onnx_export.enabled", "true", "--trainer.default_root_dir", str(folder / "run")]
-        main([str(recipe), *options])
+        options = ["--onnx_export.enabled", "true", "--trajectory_plot.every_n_epochs", "2"]
+        options += ["--wall_clock.reach", '{"position_error_m": 1000}', "--trainer.default_root_dir"]
+        main([str(recipe), *options, str(folder / "run")])
 
     return made_once("trained", train) / "run"
 

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.export.precision import half_precision
 from mambaloc.images import read_image, resized
@@ -34,7 +34,7 @@ SHARED = Path(__file__).parents[2] / "shared"
 
 def student(**kwargs):
     torch.manual_seed(0)
-    system = LitStudent(backbone="resnet10t", width=16, image_size=(32, 40), **kwargs)
+    system = LitStudent(backbone="test_efficientnet", width=16, image_size=(32, 40), **kwargs)
     system.network.head.position_scale.fit(torch.randn(9, 3))
     return system
 
@@ -171,7 +171,7 @@ def test_held_out_frames_set_the_radii(scenes):
         (found.position_error_m, found.rotation_error_deg), head.radii(found.distance).unbind(-1), strict=True
     ):
         assert (errors <= radius * (1 + 1e-5)).sum() == 12  # ceil(13 * 0.9): the largest ratio of all
-    images = torch.cat(list(data.centred_images("train", 256)))
+    images = torch.cat([batch.image for batch in data.batches("train")])
     assert torch.equal(head.references, seen_of(system.network, [images]) * head.scale)
 
 
@@ -226,7 +226,7 @@ def test_pictures_of_another_place_are_unfamiliar():
     elsewhere = [resized(read_image(path), 128)[:96] for path in sorted((SHARED / "data/fox/images").glob("*.jpg"))]
     images = (torch.from_numpy(each.transpose(2, 0, 1).copy())[None].float() / 255 for each in elsewhere)
     *_, there = head(seen_of(system.network, images))
-    *_, here = head(seen_of(system.network, data.centred_images("test")))
+    *_, here = head(seen_of(system.network, (batch.image for batch in data.batches("test"))))
     assert (there > 1).float().mean() == 1
     assert (here > 1).float().mean() < 0.2
     assert there.min() > here.median()
@@ -250,8 +250,8 @@ def test_the_localiser_tells_what_the_head_tells(exported):
     system, data, head, path = exported
     localiser = Localiser(path, 1)
     assert localiser.contract.uncertainty == {"level": 0.9, "held_out_frames": 12}
-    for frame, image in zip(data.frames("test").image_paths, torch.cat(list(data.centred_images("test"))), strict=True):
-        metres, degrees, unfamiliarity = head(pooled(system.network.backbone(image[None])))
+    for frame, batch in zip(data.frames("test").image_paths, data.batches("test", size=1), strict=True):
+        metres, degrees, unfamiliarity = head(pooled(system.network.backbone(batch.image)))
         found = localiser.localise(frame)
         assert found.position_radius_m == pytest.approx(metres.item(), rel=1e-3)
         assert found.rotation_radius_deg == pytest.approx(degrees.item(), rel=1e-3)
@@ -282,9 +282,8 @@ def test_a_contract_of_another_model_is_refused(exported, tmp_path):
         Localiser(tmp_path / "model.onnx")
 
 
-def test_a_model_that_cannot_tell_is_never_in_doubt(exported, tmp_path):
-    system, data, _, _ = exported
-    export_onnx(system, tmp_path / "model.onnx", contract_of(system, data.hparams))
-    found = Localiser(tmp_path / "model.onnx", 1).localise(data.frames("test").image_paths[0])
+def test_a_model_that_cannot_tell_is_never_in_doubt(exported, bundle_of_tensors):
+    _, data, _, _ = exported
+    found = Localiser(bundle_of_tensors / "model.onnx", 1).localise(data.frames("test").image_paths[0])
     assert (found.position_radius_m, found.rotation_radius_deg, found.unfamiliarity) == (None, None, None)
     assert not found.is_unfamiliar

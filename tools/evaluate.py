@@ -7,8 +7,7 @@ from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, print_table
-from mambaloc.evaluation.evaluate import data_of
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models import Checkpoint
 
 
 @exits_cleanly
@@ -23,14 +22,13 @@ def main(argv: list[str] | None = None) -> None:
         "--retrieval", action="store_true", help="also measure retrieval on the backbone's first features"
     )
     parser.add_class_arguments(PoseDataModule, "data")
-    checkpoint = parser.parse_args(argv, defaults=False).checkpoint
-    if checkpoint is None:
+    path = parser.parse_args(argv, defaults=False).checkpoint
+    if path is None:
         raise InputError("evaluate.py needs a checkpoint: evaluate.py RUN/checkpoints/best.ckpt")
-    parser.set_defaults(
-        {f"data.{name}": value for name, value in data_of(read_checkpoint(checkpoint), checkpoint).hparams.items()}
-    )
+    checkpoint = Checkpoint.read(path)
+    parser.set_defaults({f"data.{name}": value for name, value in checkpoint.data().hparams.items()})
     args = parser.parse_args(argv)
-    out = args.out or checkpoint.parent.parent / "evaluation" / checkpoint.stem
+    out = args.out or path.parent.parent / "evaluation" / path.stem
     data = PoseDataModule(**args.data)
     print_table([evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval)])
     print(f"{out}: metrics.json, predictions.csv, predictions.tum, trajectory.png")

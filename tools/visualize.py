@@ -5,9 +5,9 @@ from pathlib import Path
 from mambaloc.cli import OneLineErrorParser
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
-from mambaloc.evaluation.evaluate import data_of
-from mambaloc.evaluation.figures import FIGURES, Trained, draw_figures, load_trained
-from mambaloc.models.base import read_checkpoint
+from mambaloc.evaluation.figures import FIGURES, draw_figures
+from mambaloc.evaluation.trained import Trained, load_trained
+from mambaloc.models import Checkpoint
 
 
 @exits_cleanly
@@ -21,17 +21,17 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=3, help="how many test frames are shown, evenly spaced")
     parser.add_class_arguments(PoseDataModule, "data")
     args = parser.parse_args(argv, defaults=False)
-    trained = [_trained(parser, argv, checkpoint) for checkpoint in args.checkpoints]
+    trained = [_trained(parser, argv, path) for path in args.checkpoints]
     first = args.checkpoints[0]
     out = args.get("out") or first.parent.parent / "figures" / first.stem
     for path in draw_figures(args.kind, trained, out, args.get("frames", 3)):
         print(path)
 
 
-def _trained(parser: OneLineErrorParser, argv: list[str] | None, checkpoint: Path) -> Trained:
+def _trained(parser: OneLineErrorParser, argv: list[str] | None, path: Path) -> Trained:
     """Load a checkpoint with its own recipe's data under the options that were given."""
-    told = data_of(read_checkpoint(checkpoint), checkpoint).hparams
-    parser.set_defaults({f"data.{name}": value for name, value in told.items()})
+    checkpoint = Checkpoint.read(path)
+    parser.set_defaults({f"data.{name}": value for name, value in checkpoint.data().hparams.items()})
     return load_trained(checkpoint, PoseDataModule(**parser.parse_args(argv).data))
 
 

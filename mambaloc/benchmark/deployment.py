@@ -19,7 +19,7 @@ from torch import Tensor
 from mambaloc.benchmark.latency import in_turns
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.export.precision import half_precision
 from mambaloc.export.quantisation import eight_bit, median_errors

@@ -9,9 +9,9 @@ import torch
 from torch import nn
 
 from mambaloc.models import create_model, list_models
-from mambaloc.models.base import parameter_count
 from mambaloc.models.student import Student
 from mambaloc.models.transposenet import TransPoseNet
+from mambaloc.models.weights import parameter_count
 
 PAPER_MIB: dict[tuple[str, str], float] = {
     ("posenet", "none"): 85.26,

@@ -9,7 +9,7 @@ from lightning.pytorch.utilities import rank_zero_info
 
 from mambaloc.errors import InputError
 from mambaloc.export import contract_of, export_onnx
-from mambaloc.models import LitPoseRegressor, load_checkpoint
+from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.uncertainty import fit_uncertainty
 
 
@@ -30,7 +30,7 @@ class OnnxExport(L.Callback):
         assert isinstance(pl_module, LitPoseRegressor)
         best = getattr(trainer.checkpoint_callback, "best_model_path", "")
         path = Path(trainer.default_root_dir) / "model.onnx"
-        system = load_checkpoint(best) if best else pl_module
+        system = Checkpoint.read(best).system() if best else pl_module
         data = trainer.datamodule  # type: ignore[attr-defined]
         try:
             uncertainty, told = fit_uncertainty(system, data), "tells how sure it is"

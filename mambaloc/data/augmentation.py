@@ -6,13 +6,14 @@ a place that does not exist. Each image's colour jitter is one 3x4 matrix, so it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mambaloc.geometry import canonical, multiply, turn_towards
+from mambaloc.geometry import canonical, cropped_intrinsics, multiply, turn_towards
+from mambaloc.types import PoseBatch
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as torchvision and PIL
 
@@ -106,6 +107,13 @@ def center_crop(image: Tensor, crop: tuple[int, int]) -> Tensor:
 def center_corner(image: Tensor, crop: tuple[int, int]) -> tuple[int, int]:
     """Row and column of the top-left pixel of a batch's centre crop; (B, 3, H, W) -> two numbers."""
     return (image.shape[-2] - crop[0]) // 2, (image.shape[-1] - crop[1]) // 2
+
+
+def centered(batch: PoseBatch, crop: tuple[int, int]) -> PoseBatch:
+    """Take the middle of a batch's images, as :func:`center_crop`; intrinsics follow."""
+    corner = center_corner(batch.image, crop)
+    intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, *corner)
+    return replace(batch, image=center_crop(batch.image, crop), intrinsics=intrinsics)
 
 
 def turned(

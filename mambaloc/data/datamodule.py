@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import lightning as L
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler
@@ -19,8 +18,7 @@ from mambaloc.data.augmentation import (
     Jitter,
     augment,
     augmentations,
-    center_corner,
-    center_crop,
+    centered,
     draw_uniforms,
     turned,
 )
@@ -170,30 +168,29 @@ class PoseDataModule(L.LightningDataModule):
         """Test batches in order, for predictions without errors."""
         return self.test_dataloader()
 
-    def centred_images(self, part: Split, most: int | None = None) -> Iterator[Tensor]:
-        """Centre crops of a part's frames in the order of ``PoseBatch.index``, (B, 3, H, W) in 0..1.
+    def batches(self, part: Split, rows: Sequence[int] | None = None, size: int | None = None) -> Iterator[PoseBatch]:
+        """Frames of a part as validation and test see them, centre-cropped and one by one, on the CPU.
 
         Args:
             part: of those that are set up.
-            most: so many at most, evenly spread; all of them unless given.
+            rows: of :meth:`frames`; all of them unless given.
+            size: frames a batch; ``eval_batch_size`` unless given.
         """
-        images, size = self.scene.parts[part].data.images, self.hparams["eval_batch_size"]
-        rows = np.linspace(0, len(images) - 1, min(most or len(images), len(images))).round().astype(int)
+        loaded, size = self.scene.parts[part].data, size or self.hparams["eval_batch_size"]
+        frames = CachedFrames(loaded.frames, loaded.images, loaded.points)  # no clips
+        rows = range(len(frames)) if rows is None else rows
         for start in range(0, len(rows), size):
-            yield center_crop(torch.from_numpy(images[rows[start : start + size]]), self.crop)
+            yield centered(frames.__getitems__(list(rows[start : start + size])), self.crop)
 
     def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
         """Crop and normalise on the device, jitter while training; intrinsics follow each image's crop."""
         if self.trainer is None or not self.trainer.training:
-            corner: tuple[Tensor | int, Tensor | int] = center_corner(batch.image, self.crop)
-            image, quaternion = center_crop(batch.image, self.crop), batch.quaternion
-        else:
-            uniform = self._epoch_uniforms(self.trainer.current_epoch, batch.index.device)[batch.index]
-            how = augmentations(batch.image, self.crop, self.jitter, uniform)
-            corner = (how.top, how.left)
-            image = augment(batch.image, how, self.crop)
-            quaternion = turned(batch.quaternion, batch.image, how, self.crop, self._focal_ratio)
-        intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, *corner)
+            return centered(batch, self.crop)
+        uniform = self._epoch_uniforms(self.trainer.current_epoch, batch.index.device)[batch.index]
+        how = augmentations(batch.image, self.crop, self.jitter, uniform)
+        image = augment(batch.image, how, self.crop)
+        quaternion = turned(batch.quaternion, batch.image, how, self.crop, self._focal_ratio)
+        intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, how.top, how.left)
         return replace(batch, image=image, quaternion=quaternion, intrinsics=intrinsics)
 
     @cached_property

@@ -104,6 +104,10 @@ class Frames:
         digest.update(self.quaternion.tobytes())
         return digest.hexdigest()
 
+    def evenly_spread(self, most: int) -> list[int]:
+        """Indices of at most so many frames, evenly spread from the first to the last."""
+        return np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int).tolist()
+
     def by_sequence(self) -> dict[str, NDArray[np.int64]]:
         """Indices of each sequence's frames, in order of first appearance."""
         names = np.array(self.sequences)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,14 +11,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.evaluation.evaluate import localise_test_frames, median_intervals, wall_clock_of
+from mambaloc.evaluation.evaluate import median_intervals
+from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.trained import Trained
 from mambaloc.metrics import PoseErrorTable, summarise
-from mambaloc.models.base import read_checkpoint
 from mambaloc.viz.curves import Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
 from mambaloc.viz.trajectory import write_png
-
-if TYPE_CHECKING:
-    from mambaloc.evaluation.figures import Trained
 
 _ERRORS = {"position_error_m": "position error (m)", "rotation_error_deg": "rotation error (°)"}
 
@@ -45,17 +42,14 @@ def draw_time(trained: Sequence[Trained], path: Path, title: str) -> None:
     Raises:
         InputError: where a training kept no curve, as without validation.
     """
-    histories: dict[Path, list[dict[str, float]]] = {}
     for each in trained:
-        clock = wall_clock_of(read_checkpoint(each.checkpoint)) or {}
-        histories[each.checkpoint] = clock.get("history", [])
-        if not histories[each.checkpoint]:
-            raise InputError(f"{each.checkpoint}: its training was not validated; train with data.validation")
+        if not _history(each):
+            raise InputError(f"{each.checkpoint.path}: its training was not validated; train with data.validation")
 
     def draw(axes: Axes, error: str) -> None:
         curves: dict[str, list[tuple[list[float], list[float]]]] = {}
         for each in trained:
-            history = histories[each.checkpoint]
+            history = _history(each)
             line = ([reading["train_s"] for reading in history], [reading[error] for reading in history])
             curves.setdefault(each.name, []).append(line)
         plot_errors_by_time(axes, curves)
@@ -91,10 +85,15 @@ def draw_sparsity(trained: Sequence[Trained], path: Path, title: str) -> None:
     _write(draw, path, title)
 
 
+def _history(trained: Trained) -> list[dict[str, float]]:
+    """Medians of each validation of a training; none where it kept no curve."""
+    return (trained.checkpoint.wall_clock or {}).get("history", [])
+
+
 def _training_frames(trained: Trained) -> int:
-    data = read_checkpoint(trained.checkpoint)["mambaloc"].get("data")
+    data = trained.checkpoint.provenance.get("data")
     if data is None:
-        raise InputError(f"{trained.checkpoint}: does not say how many frames it was trained on; train it again")
+        raise InputError(f"{trained.checkpoint.path}: does not say how many frames it was trained on; train it again")
     return data["train_frames"]
 
 

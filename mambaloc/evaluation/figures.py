@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,10 @@ import torch
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.curves import draw_cumulative, draw_sparsity, draw_time
-from mambaloc.evaluation.evaluate import check_image_size, localise_test_frames, selection_rule
+from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.trained import Trained
 from mambaloc.files import writing
 from mambaloc.geometry import position_error_m, rotation_error_deg
-from mambaloc.models import LitPoseRegressor, load_checkpoint
-from mambaloc.models.base import read_checkpoint
 from mambaloc.types import PoseBatch
 from mambaloc.viz import (
     BranchHeat,
@@ -34,39 +32,6 @@ MOST_FRAMES = 12
 """Frames side by side in one figure."""
 
 _OUTDOORS = {"cambridge"}
-_GIS = {"gis": "with GIS", "classical": "with classical Mamba", "none": "without GIS"}
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A trained system, and the scene that it is looked at in."""
-
-    checkpoint: Path
-    system: LitPoseRegressor
-    data: PoseDataModule
-    chosen: str
-
-    @property
-    def name(self) -> str:
-        """Which system, and its GIS."""
-        return f"{self.system.registry_name} {_GIS[self.system.hparams['gis']]}"
-
-    @property
-    def run(self) -> str:
-        """Which epoch of which run."""
-        return f"{self.chosen} epoch, seed {self.system.provenance.get('seed')}"
-
-
-def load_trained(checkpoint: Path, data: PoseDataModule) -> Trained:
-    """Load a checkpoint for :func:`draw_figures`.
-
-    Raises:
-        InputError: for a bad checkpoint, or data whose crops it was not trained on.
-    """
-    chosen = selection_rule(read_checkpoint(checkpoint), checkpoint).split(":")[0]
-    trained = Trained(checkpoint, load_checkpoint(checkpoint), data, chosen)
-    check_image_size(trained.system, data, checkpoint)
-    return trained
 
 
 def draw_figures(kind: str, trained: Sequence[Trained], out: Path, frames: int = 3) -> list[Path]:
@@ -170,22 +135,21 @@ def _same_frames(trained: Sequence[Trained], count: int) -> PoseBatch:
     for each in trained:
         each.data.setup("test")
         if each.data.crop != first.data.crop:
-            sizes = f"{each.data.crop}, but {first.checkpoint} {first.data.crop}"
-            raise InputError(f"{each.checkpoint}: sees images of {sizes}; draw systems of one image size together")
+            sizes = f"{each.data.crop}, but {first.checkpoint.path} {first.data.crop}"
+            raise InputError(f"{each.checkpoint.path}: sees images of {sizes}; draw systems of one image size together")
         _check_same_frames(each, first)
     total = len(first.data.frames("test"))
     if count > total:
         raise InputError(f"--frames {count}: there are {total} test frames; give at most so many")
     rows = ((np.arange(count) + 0.5) * total / count).astype(int).tolist()
-    batch = first.data.test_dataloader().dataset.__getitems__(rows)  # type: ignore[attr-defined]
-    return first.data.on_after_batch_transfer(batch, 0)
+    return next(first.data.batches("test", rows, size=count))
 
 
 def _check_same_frames(trained: Trained, first: Trained) -> None:
     if _test_fingerprint(trained) != _test_fingerprint(first):
         raise InputError(
-            f"{trained.checkpoint}: sees other test frames than {first.checkpoint}; draw systems of one scene "
-            "together, or give them one with --data.scene"
+            f"{trained.checkpoint.path}: sees other test frames than {first.checkpoint.path}; draw systems of one "
+            "scene together, or give them one with --data.scene"
         )
 
 

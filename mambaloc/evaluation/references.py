@@ -70,9 +70,8 @@ def frozen_features(backbone: PooledBackbone, data: PoseDataModule) -> tuple[Ten
         data: set up for ``fit`` and ``test``.
     """
     backbone.eval()
-    train = [backbone(image) for image in data.centred_images("train")]
-    test = [backbone(data.on_after_batch_transfer(batch, 0).image) for batch in data.test_dataloader()]
-    return torch.cat(train), torch.cat(test)
+    train, test = (torch.cat([backbone(batch.image) for batch in data.batches(part)]) for part in ("train", "test"))
+    return train, test
 
 
 def _mean_quaternion(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -142,8 +142,8 @@ def _write_frames(
 
     As PNG: no two decoders agree on a JPEG.
     """
-    paths = data.frames("test").image_paths
-    chosen = [paths[row] for row in np.linspace(0, len(paths) - 1, min(_FRAMES, len(paths))).round().astype(int)]
+    frames = data.frames("test")
+    chosen = [frames.image_paths[row] for row in frames.evenly_spread(_FRAMES)]
     (folder / "frames").mkdir()
     told = []
     for number, path in enumerate(chosen):

@@ -66,8 +66,8 @@ class DeployedNetwork(nn.Module):
 
     def forward(self, image: Tensor) -> tuple[Tensor, ...]:
         """Localise images."""
-        feats = self.network.backbone(image)
-        prediction = self.network.head(*self.network.features(feats))
+        feats = self.network.forward_backbone(image)
+        prediction = self.network.forward_head(self.network.features(feats))
         pose = (prediction.position_m, canonical(prediction.quaternion))
         return pose if self.uncertainty is None else (*pose, *self.uncertainty(pooled(feats)))
 

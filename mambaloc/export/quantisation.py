@@ -16,9 +16,10 @@ import torch
 from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
+from torch import Tensor
 
 from mambaloc.data import PoseDataModule
-from mambaloc.metrics import PoseErrors, summarise
+from mambaloc.metrics import error_table, summarise
 from mambaloc.types import PosePrediction
 
 LARGEST_LOSS = 0.1
@@ -92,12 +93,12 @@ def median_errors(model: onnx.ModelProto, data: PoseDataModule) -> dict[str, flo
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-    errors = PoseErrors()
-    for fetched in data.test_dataloader():
-        batch = data.on_after_batch_transfer(fetched, 0)
-        position_m, quaternion = (torch.from_numpy(o) for o in session.run(None, {"image": batch.image.numpy()})[:2])
-        errors.update(PosePrediction(position_m, quaternion), batch)
-    return summarise(errors.table())
+
+    def localise(image: Tensor) -> PosePrediction:
+        position_m, quaternion, *_ = session.run(None, {"image": image.numpy()})
+        return PosePrediction(torch.from_numpy(position_m), torch.from_numpy(quaternion))
+
+    return summarise(error_table(localise, data.batches("test")))
 
 
 def sensitive_nodes(graph: onnx.GraphProto) -> list[str]:
@@ -124,7 +125,8 @@ def _prepared(model: onnx.ModelProto) -> onnx.ModelProto:
 
 def _calibration_images(data: PoseDataModule) -> list[NDArray[np.float32]]:
     """Training images evenly spread, one at a time."""
-    return [image[None].numpy() for batch in data.centred_images("train", _CALIBRATION_FRAMES) for image in batch]
+    rows = data.frames("train").evenly_spread(_CALIBRATION_FRAMES)
+    return [batch.image.numpy() for batch in data.batches("train", rows, size=1)]
 
 
 def _quantised(model: onnx.ModelProto, images: Sequence[NDArray[np.float32]], kept: Sequence[str]) -> onnx.ModelProto:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -97,6 +98,19 @@ class PoseErrors(Metric):
             position_error_m=position_error_m(predicted_m, true_m),
             rotation_error_deg=rotation_error_deg(predicted_q, true_q),
         )
+
+
+def error_table(localise: Callable[[Tensor], PosePrediction], batches: Iterable[PoseBatch]) -> PoseErrorTable:
+    """Localise frames, and return every frame's prediction and errors.
+
+    Args:
+        localise: images, (B, 3, H, W) in 0..1, to poses.
+        batches: of a split, cropped.
+    """
+    errors = PoseErrors()
+    for batch in batches:
+        errors.update(localise(batch.image), batch)
+    return errors.table()
 
 
 def summarise(table: PoseErrorTable) -> dict[str, float]:

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import inspect
-import math
-import os
-import pickle
-import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Self, get_args
 
 import lightning as L
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
-from torch.optim import lr_scheduler
 
 from mambaloc import provenance
-from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.losses import build_loss
 from mambaloc.memory import keep_freed_memory
 from mambaloc.metrics import PoseErrors
+from mambaloc.models.compiling import CompileMode, compile_forward
+from mambaloc.models.optim import Schedule, build_adam, build_step_schedule, check_span, training_steps
+from mambaloc.models.weights import build_from, read_checkpoint, start_from
 from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale
 from mambaloc.types import PoseBatch, PosePrediction, height_and_width
 
-Schedule = Literal["step", "cosine", "one_cycle"]
-CompileMode = Literal["default", "reduce-overhead"]
+BACKBONE_ARGUMENTS = {
+    "name": "backbone",
+    "weights": "backbone_weights",
+    "timm_args": "backbone_args",
+    "pixel_mean": "pixel_mean",
+    "pixel_std": "pixel_std",
+}
+"""Arguments of ``mambaloc.nn``'s backbones, and the hyperparameters that set them."""
 
 
 class LitPoseRegressor(L.LightningModule):
@@ -36,6 +39,10 @@ class LitPoseRegressor(L.LightningModule):
     A subclass builds its network in :meth:`configure_network` and registers itself with
     :func:`~mambaloc.models.registry.register_model`. Every hyperparameter is plain (str, number, bool, None, list,
     dict), so that a checkpoint loads without unpickling code.
+
+    Every training step begins with ``torch.manual_seed``, on the seed of ``lightning.seed_everything``, the epoch, the
+    step and the rank: a resumed training then continues exactly. It also restarts what a callback draws from torch's
+    global generator; a callback that needs numbers of its own keeps a ``torch.Generator``.
 
     Args:
         image_size: side of the square crop, or (height, width), in pixels; recipes set it once, in ``data``.
@@ -118,9 +125,7 @@ class LitPoseRegressor(L.LightningModule):
     @property
     def backbone_arguments(self) -> dict[str, Any]:
         """What the hyperparameters say of the backbone, as ``mambaloc.nn``'s backbones take it."""
-        names = ("backbone", "backbone_weights", "backbone_args", "pixel_mean", "pixel_std")
-        taken_as = ("name", "weights", "timm_args", "pixel_mean", "pixel_std")
-        return {theirs: self.hparams[ours] for theirs, ours in zip(taken_as, names, strict=True)}
+        return {theirs: self.hparams[ours] for theirs, ours in BACKBONE_ARGUMENTS.items()}
 
     def hyperparameters_of(self, network: type[nn.Module]) -> dict[str, Any]:
         """Those of this system's hyperparameters that a network class takes, beside its backbone and image size."""
@@ -144,16 +149,8 @@ class LitPoseRegressor(L.LightningModule):
                 if isinstance(module, PositionScale):
                     module.fit(self.scene_for("normalise_position").train_position_m)
         if stage == "fit" and self.compile_mode is not None:
-            if "CXX" not in os.environ and not any(map(shutil.which, ("c++", "g++", "clang++", "cl"))):
-                raise InputError("model.compile_mode: needs a C++ compiler; install g++, or set it to null")
-            if self.trainer.accumulate_grad_batches > 1 and self.compile_mode == "reduce-overhead":
-                raise InputError(
-                    "model.compile_mode reduce-overhead: a replayed graph overwrites gradients that are to be summed; "
-                    "set it to default, or trainer.accumulate_grad_batches to 1"
-                )
-            # The function, not the module: the state dict keeps its names, and validation, whose predictions outlive
-            # the step that a CUDA graph overwrites, runs without.
-            self._compiled = torch.compile(self.network.forward, mode=self.compile_mode)
+            accumulated = self.trainer.accumulate_grad_batches
+            self._compiled = compile_forward(self.network, self.compile_mode, accumulated)
 
     def teardown(self, stage: str) -> None:
         """Let go of what was compiled: checkpoints and copies know nothing of it."""
@@ -175,7 +172,7 @@ class LitPoseRegressor(L.LightningModule):
         self.log("train/lr", self.optimizers().param_groups[0]["lr"], sync_dist=True)  # type: ignore[union-attr]
 
     def on_train_batch_start(self, batch: PoseBatch, batch_idx: int) -> None:
-        """Tie dropout to (seed, step, rank), so that a resumed run continues exactly."""
+        """Reseed torch's global generator from (seed, epoch, step, rank): dropout then resumes exactly."""
         torch.manual_seed(hash((provenance.seed(), self.current_epoch, batch_idx, self.global_rank)))
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
@@ -232,48 +229,18 @@ class LitPoseRegressor(L.LightningModule):
         Raises:
             InputError: where a schedule over the whole training does not know its length.
         """
-        undecayed = {
-            id(parameter)
-            for module in self.modules()
-            if hasattr(module, "no_weight_decay")
-            for name, parameter in module.named_parameters()
-            if name in module.no_weight_decay()  # type: ignore[operator]  # timm's are dotted, and may name what a model lacks
-        }
-        trainable = [p for p in self.parameters() if p.requires_grad]
-        groups = [
-            {"params": [p for p in trainable if id(p) not in undecayed], "weight_decay": self.weight_decay},
-            {"params": [p for p in trainable if id(p) in undecayed], "weight_decay": 0.0},
-        ]
-        groups = [group for group in groups if group["params"]]
-        # Fused, a step reads and writes each parameter once, which is a tenth of the time on a CPU; but Lightning
-        # refuses to clip a fused optimiser's gradients under mixed precision.
+        # Lightning refuses to clip a fused optimizer's gradients under mixed precision.
         clips = self._trainer is not None and bool(self.trainer.gradient_clip_val)
-        optimizer = torch.optim.Adam(groups, lr=self.lr, betas=(0.9, 0.999), eps=1e-10, fused=not clips)
+        optimizer = build_adam(self, self.lr, self.weight_decay, fused=not clips)
         if self.schedule == "step":
-            by_epoch = lr_scheduler.StepLR(optimizer, self.lr_step_epochs, self.lr_gamma)
+            by_epoch = torch.optim.lr_scheduler.StepLR(optimizer, self.lr_step_epochs, self.lr_gamma)
             return {"optimizer": optimizer, "lr_scheduler": by_epoch}
-        steps = self._steps_in_all()
-        by_step: lr_scheduler.LRScheduler
-        if self.schedule == "cosine":
-            by_step = lr_scheduler.CosineAnnealingLR(optimizer, steps)
-        else:
-            by_step = lr_scheduler.OneCycleLR(optimizer, self.lr, steps, cycle_momentum=False)
+        by_step = build_step_schedule(optimizer, self.schedule, self.lr, self._steps_in_all())
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": by_step, "interval": "step"}}
 
     def _steps_in_all(self) -> int:
-        """Steps of the whole training, which a schedule spans.
-
-        Lightning's own estimate starts the loaders, before a resumed run has told them its epoch.
-        """
-        trainer = self.trainer
-        batches, limit = len(self.scene_for("schedule").train_dataloader()), trainer.limit_train_batches
-        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
-        ends = [] if trainer.max_steps == -1 else [trainer.max_steps]
-        if trainer.max_epochs not in (None, -1):
-            ends.append(trainer.max_epochs * math.ceil(batches / trainer.accumulate_grad_batches))
-        if not ends:
-            raise InputError(f"model.schedule {self.schedule}: needs the training's length; set trainer.max_epochs")
-        return min(ends)
+        batches = len(self.scene_for("schedule").train_dataloader())
+        return training_steps(self.trainer, batches, self.schedule)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Write which system this is and where it was trained."""
@@ -284,8 +251,9 @@ class LitPoseRegressor(L.LightningModule):
             "device": provenance.device_name(self.device.index if self.device.type == "cuda" else None),
             "seed": provenance.seed(),
         }
-        if isinstance(data := getattr(self._trainer, "datamodule", None), PoseDataModule):  # saved outside a fit, too
-            checkpoint["mambaloc"]["data"] = data.describe()
+        data = getattr(self._trainer, "datamodule", None)  # saved outside a fit, too
+        if describe := getattr(data, "describe", None):
+            checkpoint["mambaloc"]["data"] = describe()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Remember where the checkpoint came from.
@@ -295,80 +263,21 @@ class LitPoseRegressor(L.LightningModule):
         """
         self.provenance = checkpoint.get("mambaloc", {})
         if self._trainer is not None and self.trainer.state.fn == "fit" and self.schedule != "step":
-            for state in checkpoint["lr_schedulers"]:
-                spans, needed = state.get("total_steps", state.get("T_max")), self._steps_in_all()
-                if spans != needed:
-                    raise InputError(
-                        f"--ckpt_path: its schedule spans {spans} steps, this training {needed}; keep its length, or "
-                        "start from its weights with model.warm_start"
-                    )
+            check_span(checkpoint["lr_schedulers"], self._steps_in_all())
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]
-        cls, checkpoint_path: str | Path, map_location: Any = None, **kwargs: Any
+        cls, checkpoint_path: str | Path, map_location: str | torch.device | None = None, **kwargs: Any
     ) -> Self:
         """Load a trained system; weights only, never by unpickling code.
 
-        Backbone weights are in the checkpoint, so whatever started the training is not looked for again.
+        Args:
+            checkpoint_path: what a training run wrote.
+            map_location: the device to put it on; the CPU unless given.
+            kwargs: hyperparameters that replace the stored ones.
 
         Raises:
             InputError: where the file is missing, is no such checkpoint or holds anything but plain data.
         """
-        checkpoint = read_checkpoint(checkpoint_path)  # refuse with a clear line first
-        for start in ("backbone_weights", "warm_start"):
-            if start in checkpoint.get("hyper_parameters", {}):  # a system may have no such argument
-                kwargs.setdefault(start, None)
-        kwargs["weights_only"] = True
-        return super().load_from_checkpoint(checkpoint_path, map_location=map_location, **kwargs)
-
-
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint's plain data onto the CPU.
-
-    Raises:
-        InputError: where the file is missing, unreadable, or holds anything but tensors and plain data.
-    """
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such checkpoint; a training run writes them to RUN/checkpoints/")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        reason = next((line for line in str(error).splitlines() if "GLOBAL" in line), "not plain tensors").strip()
-        raise InputError(f"{path}: refused, since loading it could run code ({reason}); use a trusted export") from None
-    except Exception as error:  # torch's unpickler fails on broken files with KeyError, IndexError, struct.error, ...
-        raise InputError(f"{path}: not a readable checkpoint ({type(error).__name__}); is it complete?") from None
-    ours = checkpoint.get("mambaloc") if isinstance(checkpoint, dict) else None
-    if not isinstance(ours, dict) or "model" not in ours:
-        raise InputError(f"{path}: not a MambaLoc checkpoint; give one that a training run wrote")
-    return checkpoint
-
-
-def start_from(network: nn.Module, path: str | Path) -> None:
-    """Copy the weights of a checkpoint's network.
-
-    Raises:
-        InputError: where there is no such checkpoint, or its network is another one.
-    """
-    prefix = "network."
-    try:
-        state = read_checkpoint(path)["state_dict"]
-    except InputError as error:
-        raise InputError(f"model.warm_start: {error}; train it first, or set it to null") from None
-    try:
-        network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
-    except RuntimeError as error:
-        reason = str(error).splitlines()[-1].strip()
-        raise InputError(
-            f"model.warm_start: {path}: its network is another one ({reason}); "
-            "train that with this recipe's model arguments"
-        ) from None
-
-
-def parameter_count(network: nn.Module) -> int:
-    """Count the trainable parameters."""
-    return sum(p.numel() for p in network.parameters() if p.requires_grad)
-
-
-def mib(parameters: int) -> float:
-    """Size of so many parameters as float32, in MiB: what the paper prints as "Mb"."""
-    return parameters * 4 / 2**20
+        kwargs.pop("weights_only", None)  # Lightning's option, which might ask for more
+        return build_from(read_checkpoint(checkpoint_path), cls, **kwargs).to(map_location or "cpu")

@@ -122,7 +122,7 @@ class GoogLeNetPoseNet(PoseNet):
         if not self.training:
             return super().forward(image)
         pooled_BD, *auxiliary = self.backbone.with_auxiliary(image)
-        prediction = self.head(*self.features(pooled_BD))
+        prediction = self.forward_head(self.features(pooled_BD))
         heads = zip(self.auxiliary_heads, auxiliary, strict=True)
         return replace(prediction, auxiliary=tuple(head(feats, feats) for head, feats in heads))
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 from fnmatch import fnmatch
-from pathlib import Path
 from typing import Any, TypeVar
 
 from mambaloc.errors import InputError
-from mambaloc.models.base import LitPoseRegressor, read_checkpoint
+from mambaloc.models.base import LitPoseRegressor
 
 _MODELS: dict[str, type[LitPoseRegressor]] = {}
 _System = TypeVar("_System", bound=type[LitPoseRegressor])
@@ -52,13 +51,3 @@ def create_model(name: str, **kwargs: Any) -> LitPoseRegressor:
         InputError: for an unknown name.
     """
     return model_class(name)(**kwargs)
-
-
-def load_checkpoint(path: str | Path) -> LitPoseRegressor:
-    """Load a trained system from a checkpoint, whichever system it is, in evaluation mode on the CPU.
-
-    Raises:
-        InputError: where the file is missing, unreadable, or not a checkpoint of a registered system.
-    """
-    cls = model_class(read_checkpoint(path)["mambaloc"]["model"])
-    return cls.load_from_checkpoint(path, map_location="cpu").eval()

@@ -15,7 +15,7 @@ import yaml
 
 from mambaloc.benchmark.sizes import size_of
 from mambaloc.data.datasets.registry import DATASETS
-from mambaloc.models.base import mib
+from mambaloc.models.weights import mib
 from mambaloc.sweep.store import StoredTrial
 from mambaloc.sweep.summary import SEED, frame_counts
 

@@ -7,13 +7,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 from mambaloc.data import PoseDataModule
-from mambaloc.evaluation.evaluate import data_of
 from mambaloc.export import write_bundle
-from mambaloc.models import LitPoseRegressor
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.runtime import contract
 from mambaloc.user_cache import made_once
-from mambaloc.zoo.loading import load, released_folder
+from mambaloc.zoo.loading import is_checkpoint, load, released_folder
 from mambaloc.zoo.manifest import MANIFEST_FILE, Manifest
 
 EMBEDDED = "student.embedded_room"
@@ -32,11 +30,10 @@ def load_with_data(source: str, root: str | None = None) -> tuple[LitPoseRegress
     Raises:
         InputError: as :func:`mambaloc.load`.
     """
-    system = load(source)
-    if Path(source).is_file():
-        data = data_of(read_checkpoint(source), Path(source))
-        return system, data if root is None else PoseDataModule(**{**data.hparams, "root": root})
-    manifest = Manifest.read(released_folder(source))
+    if is_checkpoint(source):
+        checkpoint = Checkpoint.read(source)
+        return checkpoint.system(), checkpoint.data(**({} if root is None else {"root": root}))
+    system, manifest = load(source), Manifest.read(released_folder(source))
     dataset, _, scene = manifest.scene.partition("/")
     data = PoseDataModule(dataset, root, scene, image_size=system.image_size, short_side=manifest.short_side)
     return system, data

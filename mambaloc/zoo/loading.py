@@ -12,9 +12,8 @@ from huggingface_hub import snapshot_download
 from safetensors import SafetensorError
 from safetensors.torch import load as tensors_of
 
-from mambaloc import models
 from mambaloc.errors import InputError
-from mambaloc.models import LitPoseRegressor, create_model
+from mambaloc.models import Checkpoint, LitPoseRegressor, create_model
 from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest
 
 _ZOOS = (Path(__file__).parents[2] / "zoo", Path(sys.prefix) / "share/mambaloc/zoo")
@@ -38,9 +37,14 @@ def load(source: str | Path) -> LitPoseRegressor:
     Raises:
         InputError: where there is no such model, its manifest or digest is wrong, or it is of another architecture.
     """
-    if Path(source).suffix == ".ckpt" or Path(source).is_file():
-        return models.load_checkpoint(source)
+    if is_checkpoint(source):
+        return Checkpoint.read(source).system()
     return load_released(released_folder(str(source)))
+
+
+def is_checkpoint(source: str | Path) -> bool:
+    """Whether :func:`load` takes a source for a checkpoint, even one that is missing, rather than a released model."""
+    return Path(source).suffix == ".ckpt" or Path(source).is_file()
 
 
 def released_folder(source: str) -> Path:

@@ -16,11 +16,10 @@ from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.registry import licence_of_weights
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint
-from mambaloc.evaluation.evaluate import data_of, localise_test_frames
+from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.files import whole_folder
 from mambaloc.metrics import summarise
-from mambaloc.models import load_checkpoint
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models import Checkpoint
 from mambaloc.models.registry import model_class
 from mambaloc.runtime.contract import POSE
 from mambaloc.types import height_and_width
@@ -31,11 +30,11 @@ CARD_FILE = "README.md"
 _STARTS = ("backbone_weights", "warm_start")  # the released weights are whole
 
 
-def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
+def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
     """Measure a checkpoint, write it as ``ZOO/ARCH.TAG``, and measure again what was written.
 
     Args:
-        checkpoint: of a training run, whose data is still there.
+        path: of a checkpoint, whose data is still there.
         tag: of the model's name, such as ``7scenes_heads``.
         zoo: the folder that released models are in.
         accelerator: as Lightning's Trainer takes it.
@@ -46,13 +45,13 @@ def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") ->
     Raises:
         InputError: for a bad name, a name that is taken, a result without provenance, or measurements that differ.
     """
-    stored = read_checkpoint(checkpoint)
-    folder = zoo / f"{stored['mambaloc']['model']}.{tag}"
+    checkpoint = Checkpoint.read(path)
+    folder = zoo / f"{checkpoint.provenance['model']}.{tag}"
     if not re.fullmatch(r"[a-z0-9_]+", tag):
         raise InputError(f"--tag {tag}: lower-case letters, digits and underscores make a tag; choose another")
     if folder.exists():
         raise InputError(f"{folder}: is released already; choose another tag")
-    system, data = load_checkpoint(checkpoint), data_of(stored, checkpoint)
+    system, data = checkpoint.system(), checkpoint.data()
     with TemporaryDirectory() as scratch:
         measured = evaluate_checkpoint(checkpoint, Path(scratch), data, accelerator)
     with whole_folder(folder, "choose another --zoo") as partial:
@@ -67,7 +66,7 @@ def publish(checkpoint: Path, tag: str, zoo: Path, accelerator: str = "auto") ->
             pose=POSE,
             weights_sha256=hashlib.sha256(weights).hexdigest(),
             weights_bytes=len(weights),
-            trained=_plain({**stored["mambaloc"], "recipe_sha256": measured["training"]["recipe_sha256"]}),
+            trained=_plain({**checkpoint.provenance, "recipe_sha256": measured["training"]["recipe_sha256"]}),
             results=(_result(measured),),
             licence=licence_of_weights(data.hparams["dataset"]),
         )

@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from subjects import Subject
@@ -85,12 +86,25 @@ def leave_alone(below: Path) -> None:
     """No attack."""
 
 
-def steps_of(subject, inputs, out) -> int:
-    """How many steps an operation takes that nobody attacks."""
-    code, _, steps = outcome_of(subject, inputs, out, leave_alone)
-    assert code == 0
+@dataclass(frozen=True)
+class Undisturbed:
+    """An operation that nobody attacks.
+
+    Args:
+        steps: how many it takes.
+        largest_bytes: size of the largest file that it leaves.
+    """
+
+    steps: int
+    largest_bytes: int
+
+
+def undisturbed_run(subject, inputs, out) -> Undisturbed:
+    """Run an operation that nobody attacks, and check what it made."""
+    code, stderr, steps = outcome_of(subject, inputs, out, leave_alone)
+    assert code == 0, stderr
     assert subject.check(out)
-    return steps
+    return Undisturbed(steps, max(path.stat().st_size for path in out.rglob("*") if path.is_file()))
 
 
 def spread(count: int, tries: int) -> list[int]:

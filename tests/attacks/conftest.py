@@ -1,10 +1,13 @@
 """Attacks are counted: ``pytest tests/attacks --tries 100`` prints what was tried, how often, and what happened."""
 
+import json
 import shutil
 from collections import Counter
+from dataclasses import asdict
 
 import pytest
 import yaml
+from hypothesis import settings
 
 TALLY = pytest.StashKey[dict]()
 
@@ -19,6 +22,12 @@ def tries(request):
     return request.config.getoption("--tries", None) or 1
 
 
+@pytest.fixture(scope="session")
+def examples(tries):
+    """How many inputs Hypothesis feeds a reader: as many as its profile says, or ``--tries`` where that is more."""
+    return max(settings.default.max_examples, tries)
+
+
 @pytest.fixture
 def tally(request):
     """Count what happened: ``tally(attack, outcome)``."""
@@ -27,30 +36,43 @@ def tally(request):
 
 
 @pytest.fixture(scope="session")
-def inputs(scenes, tmp_path_factory):
-    """A scene, a capture of it, a recipe, a training that it led to, and a matrix of two such."""
-    from mambaloc.cli import main
+def inputs(made_once, scenes, trained):
+    """A scene, a capture of it, a recipe, a training, a sweep of two such, an ONNX model and a bundle."""
+    from subjects import bundle, export
 
-    folder = tmp_path_factory.mktemp("inputs")
-    (folder / "scenes").symlink_to(scenes)
-    model = {"backbone": "resnet10t", "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "head_hidden": 16}
-    data = {"root": str(scenes), "scene": "heads", "image_size": [32, 36], "short_side": 36, "validation": "sequences"}
-    recipe = {
-        "model": {"class_path": "LitMambaLoc", "init_args": {**model, "normalise_position": True}},
-        "data": data,
-        "trainer": {"max_epochs": 3, "accelerator": "cpu"},
-        "onnx_export": {"enabled": False},
-    }
-    (folder / "recipe.yaml").write_text(yaml.safe_dump(recipe))
-    seeds = {str(seed): ["--seed_everything", seed] for seed in range(2)}
-    axes = {"system": {"mambaloc": [str(folder / "recipe.yaml")]}, "seed": seeds}
-    (folder / "matrix.yaml").write_text(yaml.safe_dump({"axes": axes}))
-    for kind, suffix, of in (("color", "png", "color.png"), ("pose", "txt", "pose.txt")):
-        (folder / "capture" / kind).mkdir(parents=True)
-        for number, file in enumerate(sorted((scenes / "heads").glob(f"seq-0[12]/*.{of}"))):
-            shutil.copy(file, folder / "capture" / kind / f"{number}.{suffix}")
-    main([str(folder / "recipe.yaml"), "--trainer.default_root_dir", str(folder / "run")])
-    return folder
+    def gather(folder):
+        (folder / "scenes").symlink_to(scenes)
+        (folder / "run").symlink_to(trained)
+        recipe = yaml.safe_load((trained.parent / "recipe.yaml").read_text())
+        recipe["trainer"] |= {"max_epochs": 2, "limit_train_batches": 2}
+        (folder / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+        seeds = {str(seed): ["--seed_everything", seed] for seed in range(2)}
+        axes = {"system": {"mambaloc": [str(folder / "recipe.yaml")]}, "seed": seeds}
+        (folder / "sweep.yaml").write_text(yaml.safe_dump({"axes": axes}))
+        for kind, suffix, of in (("color", "png", "color.png"), ("pose", "txt", "pose.txt")):
+            (folder / "capture" / kind).mkdir(parents=True)
+            for number, file in enumerate(sorted((scenes / "heads").glob(f"seq-0[12]/*.{of}"))):
+                shutil.copy(file, folder / "capture" / kind / f"{number}.{suffix}")
+        export(folder, folder)
+        bundle(folder, folder)
+
+    return made_once("inputs of attacks", gather)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(made_once, inputs):
+    """``undisturbed(name)``: what a subject's operation comes to that nobody attacks; it runs once for all workers."""
+    from attacked import Undisturbed, undisturbed_run
+    from subjects import SUBJECTS
+
+    def run(name):
+        def measure(folder):
+            found = undisturbed_run(SUBJECTS[name], inputs, folder / "out")
+            (folder / "measured.json").write_text(json.dumps(asdict(found)))
+
+        return Undisturbed(**json.loads((made_once(f"undisturbed {name}", measure) / "measured.json").read_text()))
+
+    return run
 
 
 def pytest_terminal_summary(terminalreporter, config):

@@ -25,8 +25,15 @@ def a_file(below: Path) -> None:
     below.write_text("mine")
 
 
-@pytest.mark.parametrize("name", SUBJECTS)
-@pytest.mark.parametrize("attack", [read_only, a_file])
+# Each way to write has one of them in the gate: a file, a folder, the cache, Lightning's run, the store of a sweep.
+SAME_WAY = ("export", "bundle", "publishing", "evaluation")
+READ_ONLY = [
+    pytest.param(read_only, name, marks=[pytest.mark.nightly] if name in SAME_WAY else [], id=f"read_only-{name}")
+    for name in SUBJECTS
+]
+
+
+@pytest.mark.parametrize(("attack", "name"), [*READ_ONLY, *((a_file, name) for name in SUBJECTS)])
 def test_no_folder_to_write_to(name, attack, inputs, tmp_path, tally):
     subject, out = SUBJECTS[name], tmp_path / "out"
     code, stderr, _ = outcome_of(subject, inputs, out, attack)

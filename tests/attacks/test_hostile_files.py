@@ -25,7 +25,7 @@ from mambaloc.errors import InputError
 from mambaloc.images import decode_image
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import read_capture
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models.weights import read_checkpoint
 from mambaloc.rendering import read_pose_table, shots_of_sequences, write_cambridge
 from mambaloc.rendering.trajectories import smooth_trajectory
 from mambaloc.runtime import Contract, Localiser
@@ -99,14 +99,14 @@ def frames_7scenes(tmp_path_factory, scenes):
 
 
 @pytest.fixture
-def fed(tries, tally, tmp_path):
-    """Feed a parser one whole file with damages, ``tries`` times or more."""
+def fed(examples, tally):
+    """Feed a parser one whole file with damages."""
 
-    def feed(name: str, parse: Callable[[Path], object], target: Path) -> None:
+    def feed(name: str, parse: Callable[[Path], object], target: Path, most: int = examples) -> None:
         whole = target.read_bytes()
         parse(target)  # what is damaged is a whole file
 
-        @settings(max_examples=max(40, tries), deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+        @settings(max_examples=most, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
         @given(damages())
         def attacked(damage):
             target.write_bytes(damage(whole))
@@ -291,25 +291,18 @@ def test_contracts(tmp_path, fed):
 
 
 @pytest.mark.slow
-def test_checkpoints(tiny_recipe, tmp_path, fed):
-    from mambaloc.cli import main
-
-    main([str(tiny_recipe), "--trainer.max_epochs", "1", "--trainer.default_root_dir", str(tmp_path / "run")])
-    fed("checkpoint", read_checkpoint, tmp_path / "run/checkpoints/last.ckpt")
+def test_checkpoints(trained, tmp_path, fed):
+    fed("checkpoint", read_checkpoint, Path(shutil.copy(trained / "checkpoints/last.ckpt", tmp_path)))
 
 
 @pytest.mark.slow
 def test_bundles(inputs, tmp_path, fed):
-    from subjects import bundle
-
-    bundle(inputs, tmp_path)
-    fed("bundle's contract", lambda path: verify_bundle(path.parent, 1), tmp_path / "bundle/contract.json")
+    folder = shutil.copytree(inputs / "bundle", tmp_path / "bundle")
+    fed("bundle's contract", lambda path: verify_bundle(path.parent, 1), folder / "contract.json")
 
 
 @pytest.mark.slow
-def test_models(scenes, tmp_path, fed):
-    from subjects import export
-
-    (tmp_path / "scenes").symlink_to(scenes)
-    export(tmp_path, tmp_path)
-    fed("ONNX model", lambda path: Localiser(path, 1), tmp_path / "model.onnx")
+def test_models(inputs, tmp_path, fed):
+    model = Path(shutil.copy(inputs / "model.onnx", tmp_path))
+    few = settings.get_profile("ci").max_examples  # ONNX Runtime's parser is C++ in this process: no long campaign
+    fed("ONNX model", lambda path: Localiser(path, 1), model, most=few)

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from attacked import assert_goes_on, assert_one_line, audited, outcome_of, spread, steps_of
-from subjects import SUBJECTS
+from attacked import assert_goes_on, assert_one_line, audited, outcome_of, spread
+from subjects import CONVERSION, SUBJECTS
 
 pytestmark = pytest.mark.slow
 
@@ -33,9 +33,9 @@ def sizes(largest: int, tries: int) -> list[int]:
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
-def test_killed_before_any_step(name, inputs, tmp_path, tries, tally):
+def test_killed_before_any_step(name, inputs, undisturbed, tmp_path, tries, tally):
     subject = SUBJECTS[name]
-    for step in spread(steps_of(subject, inputs, tmp_path / "whole"), tries):
+    for step in spread(undisturbed(name).steps, tries):
         out = tmp_path / f"step {step}"
         assert outcome_of(subject, inputs, out, partial(kill_before, step))[0] is None
         finished = subject.check(out)
@@ -45,12 +45,10 @@ def test_killed_before_any_step(name, inputs, tmp_path, tries, tally):
 
 @pytest.mark.parametrize("name", SUBJECTS)
 @pytest.mark.parametrize("how", ["killed", "full disk"])
-def test_a_write_that_cannot_end(name, how, inputs, tmp_path, tries, tally):
+def test_a_write_that_cannot_end(name, how, inputs, undisturbed, tmp_path, tries, tally):
     subject = SUBJECTS[name]
-    steps_of(subject, inputs, tmp_path / "whole")
-    largest = max(path.stat().st_size for path in (tmp_path / "whole").rglob("*") if path.is_file())
     signals = {"killed": signal.SIG_DFL, "full disk": signal.SIG_IGN}
-    for size in sizes(largest, tries):
+    for size in sizes(undisturbed(name).largest_bytes, tries):
         out = tmp_path / f"{size} bytes"
         code, stderr, _ = outcome_of(subject, inputs, out, partial(limit, size, signals[how]))
         if code is None:
@@ -60,3 +58,11 @@ def test_a_write_that_cannot_end(name, how, inputs, tmp_path, tries, tally):
             assert_one_line(stderr)
         tally(f"{name}: {how} within a write", "one line, exit code 2" if code else "killed")
         assert_goes_on(subject, inputs, out)
+
+
+def test_a_conversion_is_killed_within_its_write(inputs, undisturbed, tmp_path):
+    """The file that other exports are given here is written as the exporter itself writes it."""
+    half = partial(limit, undisturbed("export").largest_bytes // 2, signal.SIG_DFL)
+    assert outcome_of(CONVERSION, inputs, tmp_path, half)[0] is None
+    assert not (tmp_path / "model.onnx").exists()
+    assert_goes_on(SUBJECTS["export"], inputs, tmp_path)

@@ -91,10 +91,10 @@ READERS = (frames_csv, cambridge_labels, transforms_json, csv_table, tum_listing
 
 
 @pytest.mark.parametrize("read", READERS)
-def test_no_name_leads_out(read, folder, tries, tally):
+def test_no_name_leads_out(read, folder, examples, tally):
     followed = []
 
-    @settings(max_examples=max(60, tries), deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(names)
     @example("../secret.png")
     @example("HERE/../secret.png")
@@ -117,13 +117,13 @@ def everything(folder):
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
-def test_no_member_of_a_zip_leads_out(folder, tries, tally):
+def test_no_member_of_a_zip_leads_out(folder, examples, tally):
     archive = folder.parent / "a.zip"
     archive.touch()
     outside = {path for path in everything(folder.parent) if not path.is_relative_to(folder)}
     written = []
 
-    @settings(max_examples=max(60, tries), deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(st.lists(st.tuples(names, st.booleans()), min_size=1, max_size=3, unique_by=lambda member: member[0]))
     @example([("../secret.png", False)])
     @example([("way", True), ("way/secret.png", False)])

@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from attacked import SERVER, Attacked, assert_one_line, audited, leave_alone, outcome_of, spread, steps_of
+from attacked import SERVER, Attacked, assert_one_line, audited, leave_alone, outcome_of, spread
 from subjects import SUBJECTS
 
 pytestmark = pytest.mark.slow
@@ -22,9 +22,9 @@ def wait_before(step: int, arrived, other_ended, below: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
-def test_two_at_once(name, inputs, tmp_path, tries, tally):
+def test_two_at_once(name, inputs, undisturbed, tmp_path, tries, tally):
     subject = SUBJECTS[name]
-    for step in spread(steps_of(subject, inputs, tmp_path / "whole"), tries):
+    for step in spread(undisturbed(name).steps, tries):
         out, arrived, other_ended = tmp_path / f"step {step}", SERVER.Event(), SERVER.Event()
         first = Attacked(subject, inputs, out, partial(wait_before, step, arrived, other_ended))
         assert arrived.wait(300)

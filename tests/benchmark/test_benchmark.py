@@ -12,7 +12,7 @@ from mambaloc.benchmark.sizes import UNEXPLAINED
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.models import create_model
-from mambaloc.models.base import mib
+from mambaloc.models.weights import mib
 
 
 def test_latency_is_timed_in_turns(monkeypatch):

@@ -21,6 +21,8 @@ from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Localiser, Preprocessing
 from mambaloc.runtime.bundle import verify_bundle
 
+pytestmark = pytest.mark.usefixtures("converted_once")
+
 
 @pytest.fixture(scope="module")
 def student():

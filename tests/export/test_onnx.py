@@ -25,7 +25,7 @@ DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 56}
 def tiny(gis: str = "gis", **kwargs) -> LitMambaLoc:
     torch.manual_seed(0)
     system = LitMambaLoc(
-        backbone="mobilenetv3_small_050", encoder_layers=1, dim=16, heads=2, feedforward=16, head_hidden=16,
+        backbone="test_efficientnet", encoder_layers=1, dim=16, heads=2, feedforward=16, head_hidden=16,
         image_size=SIZE, gis=gis, **kwargs,
     )  # fmt: skip
     with torch.no_grad():

@@ -10,13 +10,13 @@ import torch
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.export import contract_of, export_onnx, quantisation, write_bundle
 from mambaloc.export.quantisation import eight_bit, median_errors, sensitive_nodes
 from mambaloc.metrics import summarise
 from mambaloc.models.student import LitStudent
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("converted_once")]
 
 
 @pytest.fixture(scope="module")

@@ -189,7 +189,8 @@ def in_one_process(rank: int, folder: Path) -> None:
 
 @pytest.mark.slow
 def test_uneven_processes_agree_with_a_single_one(tmp_path):
-    torch.multiprocessing.spawn(in_one_process, (tmp_path,), nprocs=len(SHARDS))
+    # Forked, as a DataLoader's workers are: they need not import torch again.
+    torch.multiprocessing.start_processes(in_one_process, (tmp_path,), nprocs=len(SHARDS), start_method="fork")
     single = PoseErrors()
     single.update(*frames(10))
     for rank, batches in enumerate(SHARDS):

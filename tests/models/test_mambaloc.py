@@ -10,9 +10,9 @@ from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
 from mambaloc.errors import InputError
-from mambaloc.models import load_checkpoint
-from mambaloc.models.base import mib, parameter_count
+from mambaloc.models import Checkpoint
 from mambaloc.models.mambaloc import LitMambaLoc, MambaLoc
+from mambaloc.models.weights import mib, parameter_count
 from mambaloc.nn import PositionScale
 from mambaloc.types import PoseBatch
 
@@ -229,7 +229,7 @@ def test_position_statistics_are_taken_from_training_and_saved(tmp_path, normali
     run = trainer(tmp_path)
     run.fit(system, datamodule=scene)
     run.save_checkpoint(tmp_path / "last.ckpt")
-    mean_m = load_checkpoint(tmp_path / "last.ckpt").network.head.position_scale.mean_m
+    mean_m = Checkpoint.read(tmp_path / "last.ckpt").system().network.head.position_scale.mean_m
     assert_close(mean_m, scene.train_position_m.mean(0) if normalise else torch.zeros(3))
 
 
@@ -252,5 +252,5 @@ def test_backbone_weights_are_not_looked_for_again(tmp_path):
     run.strategy.connect(system)
     run.save_checkpoint(tmp_path / "last.ckpt")
     weights.unlink()
-    loaded = load_checkpoint(tmp_path / "last.ckpt")
+    loaded = Checkpoint.read(tmp_path / "last.ckpt").system()
     assert all(torch.equal(v, loaded.state_dict()[k]) for k, v in system.state_dict().items())

@@ -10,7 +10,7 @@ from mambaloc.errors import InputError
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.models.posenet import GoogLeNetBackbone
 
-SMALL = {"backbone": "mobilenetv3_small_050", "image_size": 64, "width": 32}
+SMALL = {"backbone": "test_efficientnet", "image_size": 64, "width": 32}
 
 
 @pytest.fixture(scope="module")

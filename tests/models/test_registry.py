@@ -7,9 +7,9 @@ from torch import Tensor, nn
 
 import mambaloc
 from mambaloc.errors import InputError
-from mambaloc.models import LitPoseRegressor, create_model, list_models, load_checkpoint, register_model, registry
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models import Checkpoint, LitPoseRegressor, create_model, list_models, register_model, registry
 from mambaloc.models.mambaloc import LitMambaLoc
+from mambaloc.models.weights import start_from
 from mambaloc.types import PosePrediction
 
 
@@ -106,7 +106,7 @@ def test_load_finds_the_class_of_a_checkpoint(tmp_path):
     for name, kwargs in {"mean": {"gain": 2.0, "lr": 0.5}, "mambaloc": small}.items():
         system = create_model(name, **kwargs)
         save(system, tmp_path / f"{name}.ckpt")
-        loaded = load_checkpoint(tmp_path / f"{name}.ckpt")
+        loaded = Checkpoint.read(tmp_path / f"{name}.ckpt").system()
         assert type(loaded) is type(system)
         assert not loaded.training
         assert {k: loaded.hparams[k] for k in kwargs} == kwargs
@@ -120,7 +120,7 @@ def test_a_checkpoint_of_a_system_that_is_not_here_is_refused(tmp_path):
     save(create_model("mean_place"), tmp_path / "last.ckpt")
     del registry._MODELS["mean_place"]
     with pytest.raises(InputError, match="mean_place"):
-        load_checkpoint(tmp_path / "last.ckpt")
+        Checkpoint.read(tmp_path / "last.ckpt").system()
 
 
 class Malicious:
@@ -147,9 +147,9 @@ def write_pickle(value, path) -> None:
 
 READERS = pytest.mark.parametrize(
     "read",
-    [load_checkpoint, read_checkpoint, LitMambaLoc.load_from_checkpoint,
+    [Checkpoint.read, lambda path: start_from(nn.Linear(1, 1), path), LitMambaLoc.load_from_checkpoint,
      lambda path: LitMambaLoc.load_from_checkpoint(path, weights_only=False)],
-    ids=["load", "read_checkpoint", "load_from_checkpoint", "asked_for_pickles"],
+    ids=["read", "warm_start", "load_from_checkpoint", "asked_for_pickles"],
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import cv2
 import pytest
 import torch
 
-from mambaloc.callbacks import PoseProgressBar, WallClock, WholeCheckpoints, progress, wall_clock
+from mambaloc.callbacks import PoseProgressBar, TrajectoryPlot, WallClock, WholeCheckpoints, progress, wall_clock
 from mambaloc.cli import main
 from mambaloc.errors import InputError
 
@@ -93,19 +93,18 @@ def test_progress_bar_draws_at_intervals_not_at_steps(monkeypatch):
 @pytest.mark.parametrize(("patience", "epochs"), [(2, 3), (0, 5)])
 def test_early_stopping_waits_for_its_patience(patience, epochs, rhythm, tiny_recipe, tmp_path):
     options = [*rhythm, "--early_stopping.patience", str(patience), "--early_stopping.min_delta", "1e9"]
+    options += ["--best_checkpoint.save_top_k", "0"]
     main([str(tiny_recipe), *options, "--trainer.max_epochs", "5", "--trainer.default_root_dir", str(tmp_path / "run")])
     with (tmp_path / "run/metrics/version_0/metrics.csv").open() as file:
         assert max(int(row["epoch"]) for row in csv.DictReader(file)) + 1 == epochs
 
 
-@pytest.mark.slow
-def test_trajectory_plot_is_drawn_when_due(tiny_recipe, tmp_path):
-    run = tmp_path / "run"
-    options = ["--trajectory_plot.every_n_epochs", "2", "--trainer.default_root_dir", str(run)]
-    main([str(tiny_recipe), *options, "--trainer.max_epochs", "1"])
-    assert not (run / "validation.png").exists()
-    main([str(tiny_recipe), *options, "--ckpt_path", str(run / "checkpoints/last.ckpt"), "--trainer.max_epochs", "2"])
-    image = cv2.imread(str(run / "validation.png"))
+def test_trajectory_plot_is_drawn_when_due(trained, tmp_path):
+    """In the second of three epochs, where every second is due; not in a first one."""
+    first = SimpleNamespace(current_epoch=0, sanity_checking=False, fast_dev_run=False, default_root_dir=tmp_path)
+    TrajectoryPlot(every_n_epochs=2).on_validation_epoch_end(first, CPU)
+    assert not list(tmp_path.iterdir())
+    image = cv2.imread(str(trained / "validation.png"))
     green, red = (
         cv2.inRange(image, *(tuple(c + d for c in bgr) for d in (-12, 12))) for bgr in ((80, 152, 26), (39, 48, 215))
     )

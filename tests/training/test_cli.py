@@ -2,6 +2,7 @@
 
 import csv
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -16,24 +17,11 @@ from mambaloc.errors import InputError
 REPOSITORY = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A finished run of the tiny recipe, export and plots included."""
-    return tmp_path_factory.mktemp("runs") / "tiny"
-
-
-@pytest.fixture
-def finished(run, tiny_recipe):
-    if not run.exists():
-        options = ["--onnx_export.enabled", "true", "--trajectory_plot.every_n_epochs", "2"]
-        options += ["--wall_clock.reach", '{"position_error_m": 1000}']
-        main([str(tiny_recipe), "--trainer.default_root_dir", str(run), *options])
-    return run
-
-
 def tool(name, *words):
-    command = [sys.executable, REPOSITORY / "tools" / f"{name}.py", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    """Run a tool in this process, which has imported what it needs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [name, *map(str, words)])
+        runpy.run_path(str(REPOSITORY / "tools" / f"{name}.py"), run_name="__main__")
 
 
 def test_recipes_come_first_and_become_configs(tmp_path):
@@ -86,11 +74,11 @@ def test_mistake_is_one_line_and_exit_code_2(options, words, tiny_recipe, capsys
 
 
 @pytest.mark.slow
-def test_run_leaves_everything(finished):
+def test_run_leaves_everything(trained):
     for name in ("config.yaml", "model.onnx", "validation.png", "checkpoints/best.ckpt", "checkpoints/last.ckpt"):
-        assert (finished / name).stat().st_size > 0
-    assert list(finished.glob("events.out.tfevents*"))
-    metrics = json.loads((finished / "evaluation/best/metrics.json").read_text())
+        assert (trained / name).stat().st_size > 0
+    assert list(trained.glob("events.out.tfevents*"))
+    metrics = json.loads((trained / "evaluation/best/metrics.json").read_text())
     assert metrics["count"] == 8
     assert metrics["selection"].startswith("best: lowest val/loss on frames held out")
     assert metrics["data"]["scene"] == "heads"
@@ -105,8 +93,8 @@ def test_run_leaves_everything(finished):
 
 
 @pytest.mark.slow
-def test_predictions_agree_with_metrics(finished):
-    folder = finished / "evaluation/last"
+def test_predictions_agree_with_metrics(trained):
+    folder = trained / "evaluation/last"
     with (folder / "predictions.csv").open() as file:
         rows = list(csv.DictReader(file))
     errors = torch.tensor([float(row["position_error_m"]) for row in rows])
@@ -119,23 +107,25 @@ def test_predictions_agree_with_metrics(finished):
 
 
 @pytest.mark.slow
-def test_saved_config_retrains_the_same(finished, tmp_path):
-    main([str(finished / "config.yaml"), "--trainer.default_root_dir", str(tmp_path / "again")])
-    weights = [torch.load(r / "checkpoints/last.ckpt", weights_only=True) for r in (finished, tmp_path / "again")]
+def test_saved_config_retrains_the_same(trained, tmp_path):
+    words = ["--onnx_export.enabled", "false", "--best_checkpoint.save_top_k", "0"]
+    main([str(trained / "config.yaml"), *words, "--trainer.default_root_dir", str(tmp_path / "again")])
+    weights = [torch.load(r / "checkpoints/last.ckpt", weights_only=True) for r in (trained, tmp_path / "again")]
     torch.testing.assert_close(weights[0]["state_dict"], weights[1]["state_dict"], rtol=0, atol=0)
 
 
 @pytest.mark.slow
-def test_evaluate_tool_prints_and_writes(finished, tmp_path):
-    checkpoint = finished / "checkpoints/last.ckpt"
-    done = tool("evaluate", checkpoint, "--out", tmp_path / "out", "--data.eval_batch_size", 3)
+def test_evaluate_tool_prints_and_writes(trained, tmp_path):
+    """In a process of its own, whose stderr is seen whole."""
+    words = [trained / "checkpoints/last.ckpt", "--out", tmp_path / "out", "--data.eval_batch_size", "3"]
+    command = [sys.executable, REPOSITORY / "tools/evaluate.py", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert "last" in done.stdout
     assert "median training pose" in done.stdout
     metrics = [
-        json.loads((f / "metrics.json").read_text())["metrics"]
-        for f in (tmp_path / "out", finished / "evaluation/last")
+        json.loads((f / "metrics.json").read_text())["metrics"] for f in (tmp_path / "out", trained / "evaluation/last")
     ]
     assert metrics[0] == pytest.approx(metrics[1], rel=1e-4)
 
@@ -150,16 +140,20 @@ def test_evaluate_tool_prints_and_writes(finished, tmp_path):
         (["pyproject.toml"], "pyproject.toml"),
     ],
 )
-def test_evaluate_tool_used_wrong(words, rule, finished):
-    done = tool("evaluate", *(finished / "checkpoints/last.ckpt" if w == "CHECKPOINT" else w for w in words))
-    assert done.returncode == 2
-    assert rule in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+def test_evaluate_tool_used_wrong(words, rule, trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(REPOSITORY)
+    words = [trained / "checkpoints/last.ckpt" if word == "CHECKPOINT" else word for word in words]
+    with pytest.raises(SystemExit) as exit_:
+        tool("evaluate", *words, "--out", tmp_path / "out")
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert rule in error
+    assert len(error.strip().splitlines()) == 1
 
 
 @pytest.mark.slow
-def test_loaded_system_localises(finished):
-    system = mambaloc.load(finished / "checkpoints/best.ckpt")
+def test_loaded_system_localises(trained):
+    system = mambaloc.load(trained / "checkpoints/best.ckpt")
     assert isinstance(system, mambaloc.LitMambaLoc)
     with torch.inference_mode():
         prediction = system(torch.rand(2, 3, 32, 32))
@@ -168,19 +162,13 @@ def test_loaded_system_localises(finished):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("validation", ["none", "test_set"])
-def test_selection_rule_is_written_into_the_result(validation, tiny_recipe, tmp_path):
-    options = [
-        "--data.validation",
-        validation,
-        "--trainer.max_epochs",
-        "1",
-        "--trainer.default_root_dir",
-        str(tmp_path),
-    ]
-    main([str(tiny_recipe), *options])
-    results = [json.loads(p.read_text())["selection"] for p in sorted(tmp_path.glob("evaluation/*/metrics.json"))]
-    if validation == "none":
-        assert results == ["last"]
-    else:
-        assert "ON THE TEST SET" in results[0]
+def test_selection_rule_is_written_into_the_result(trained_student, tiny_recipe, tmp_path):
+    """Without validation, and where the test frames are what is validated on."""
+    words = ["--data.validation", "test_set", "--trainer.max_epochs", "1", "--trainer.default_root_dir", str(tmp_path)]
+    main([str(tiny_recipe), *words])
+    unvalidated, on_test = (
+        [json.loads(path.read_text())["selection"] for path in sorted(run.glob("evaluation/*/metrics.json"))]
+        for run in (trained_student, tmp_path)
+    )
+    assert unvalidated == ["last"]
+    assert "ON THE TEST SET" in on_test[0]

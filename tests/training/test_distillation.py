@@ -10,11 +10,11 @@ from mambaloc.cli import main
 from mambaloc.data import PoseDataModule
 from mambaloc.distillation import LitDistillation, Teacher
 from mambaloc.errors import InputError
-from mambaloc.models.base import read_checkpoint
 from mambaloc.models.student import LitStudent
+from mambaloc.models.weights import read_checkpoint
 from mambaloc.types import PoseBatch
 
-SMALL = {"backbone": "resnet10t", "width": 16, "image_size": 32}
+SMALL = {"backbone": "test_efficientnet", "width": 16, "image_size": 32}
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +22,8 @@ def teacher(tmp_path_factory):
     """A checkpoint of a system with its own position scale and pixel statistics."""
     torch.manual_seed(7)
     system = mambaloc.create_model(
-        "mambaloc", backbone="resnet10t", image_size=32, dim=8, heads=2, encoder_layers=1, feedforward=8, head_hidden=8,
-        pixel_mean=[0.1, 0.2, 0.3], pixel_std=[0.5, 0.6, 0.7],
+        "mambaloc", backbone=SMALL["backbone"], image_size=32, dim=8, heads=2, encoder_layers=1, feedforward=8,
+        head_hidden=8, pixel_mean=[0.1, 0.2, 0.3], pixel_std=[0.5, 0.6, 0.7],
     )  # fmt: skip
     system.network.head.position_scale.fit(torch.randn(20, 3) * 3 + 5)
     return saved(system, tmp_path_factory.mktemp("teacher") / "teacher.ckpt")
@@ -140,9 +140,7 @@ def test_kept_answers_are_those_of_the_centre_crops(teacher, scenes, tmp_path, m
     trainer = fit(system, scenes, tmp_path, epochs=3)
     frames = trainer.datamodule.frames("train")
     assert sum(asked[1:]) == len(system.answers.position_m) == len(frames)  # the first asks for its width
-    expected = torch.cat(
-        [answer(system.teacher, image).feature for image in trainer.datamodule.centred_images("train")]
-    )
+    expected = torch.cat([answer(system.teacher, batch.image).feature for batch in trainer.datamodule.batches("train")])
     assert torch.equal(system.answers.feature, expected)
     assert torch.equal(system.answers.of(torch.tensor([3, 1])).feature, expected[[3, 1]])
 
@@ -174,13 +172,37 @@ def test_distillation_resumes_exactly(teacher, scenes, tmp_path):
     assert all(torch.equal(value, state[name]) for name, value in resumed.state_dict().items())
 
 
+@pytest.fixture(scope="module")
+def distilled(teacher, scenes, tmp_path_factory):
+    """A recipe, and the folder of its run of two epochs."""
+    folder = tmp_path_factory.mktemp("distilled")
+    arguments = {"teacher": teacher, "backbone": SMALL["backbone"], "width": SMALL["width"]}
+    content = {
+        "model": {"class_path": "LitDistillation", "init_args": arguments},
+        "data": {"root": str(scenes), "scene": "heads", "image_size": 32, "short_side": 36, "validation": "sequences"},
+        "trainer": {"max_epochs": 2, "accelerator": "cpu"},
+    }
+    recipe = folder / "distil.yaml"
+    recipe.write_text(yaml.safe_dump(content))
+    main([str(recipe), "--trainer.default_root_dir", str(folder / "run")])
+    return recipe, folder / "run"
+
+
 @pytest.mark.slow
-def test_a_recipe_resumes_the_distillation(teacher, scenes, tmp_path):
-    recipe = distillation_recipe(teacher, scenes, tmp_path)
-    main([str(recipe), "--trainer.default_root_dir", str(tmp_path / "whole")])
-    main([str(recipe), "--trainer.max_epochs", "1"])
-    main([str(recipe), "--ckpt_path", str(tmp_path / "run/checkpoints/last.ckpt")])
-    whole, resumed = (read_checkpoint(tmp_path / run / "checkpoints/last.ckpt") for run in ("whole", "run"))
+def test_a_recipe_distils_and_evaluates(distilled):
+    _, run = distilled
+    assert type(mambaloc.load(run / "checkpoints/last.ckpt")) is LitStudent
+    assert (run / "evaluation/best/metrics.json").is_file()
+    assert (run / "model.onnx").is_file()
+
+
+@pytest.mark.slow
+def test_a_recipe_resumes_the_distillation(teacher, distilled, tmp_path):
+    recipe, run = distilled
+    words = [str(recipe), "--onnx_export.enabled", "false", "--best_checkpoint.save_top_k", "0"]
+    main([*words, "--trainer.default_root_dir", str(tmp_path), "--trainer.max_epochs", "1"])
+    main([*words, "--ckpt_path", str(tmp_path / "checkpoints/last.ckpt")])
+    whole, resumed = (read_checkpoint(folder / "checkpoints/last.ckpt") for folder in (run, tmp_path))
     assert resumed["mambaloc"]["distilled"]["teacher"] == teacher
     torch.testing.assert_close(resumed["state_dict"], whole["state_dict"], rtol=0, atol=0)
     torch.testing.assert_close(resumed["distillation"], whole["distillation"], rtol=0, atol=0)
@@ -211,20 +233,3 @@ def test_a_plain_students_checkpoint_resumes_no_distillation(teacher, scenes, tm
 def test_mistakes_are_named(kwargs, message, teacher):
     with pytest.raises(InputError, match=message):
         student_of(**{"teacher": teacher, **kwargs})
-
-
-def distillation_recipe(teacher, scenes, tmp_path):
-    recipe = tmp_path / "distil.yaml"
-    student = {"class_path": "LitDistillation", "init_args": {"teacher": teacher, "backbone": "resnet10t", "width": 16}}
-    scene = {"root": str(scenes), "scene": "heads", "image_size": 32, "short_side": 36, "validation": "sequences"}
-    trainer = {"max_epochs": 2, "accelerator": "cpu", "default_root_dir": str(tmp_path / "run")}
-    recipe.write_text(yaml.safe_dump({"model": student, "data": scene, "trainer": trainer}))
-    return recipe
-
-
-@pytest.mark.slow
-def test_a_recipe_distils_and_evaluates(teacher, scenes, tmp_path):
-    main([str(distillation_recipe(teacher, scenes, tmp_path))])
-    assert type(mambaloc.load(tmp_path / "run/checkpoints/last.ckpt")) is LitStudent
-    assert (tmp_path / "run/evaluation/best/metrics.json").is_file()
-    assert (tmp_path / "run/model.onnx").is_file()

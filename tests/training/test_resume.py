@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mambaloc.cli import main
-from mambaloc.models.base import read_checkpoint
+from mambaloc.models.weights import read_checkpoint
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -42,16 +42,16 @@ def train(recipe, run, *options):
     main([str(recipe), "--trainer.default_root_dir", str(run), *options])
 
 
-def test_resumed_run_equals_an_uninterrupted_one(tiny_recipe, tmp_path):
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    train(tiny_recipe, whole)
+def test_resumed_run_equals_an_uninterrupted_one(trained, tiny_recipe, tmp_path):
+    cut = tmp_path / "cut"
     train(tiny_recipe, cut, "--trainer.max_epochs", "2")
     assert set(epochs_of(cut)) == {0, 1}
-    main([str(tiny_recipe), "--ckpt_path", str(cut / "checkpoints/last.ckpt")])
+    main([str(tiny_recipe), "--ckpt_path", str(cut / "checkpoints/last.ckpt"), "--trainer.max_epochs", "3"])
 
-    epochs = epochs_of(whole)
+    epochs = epochs_of(trained)
+    assert set(epochs) == {0, 1, 2}
     assert epochs[2]["train/lr"] == pytest.approx(epochs[1]["train/lr"] / 10)  # the step falls where the run was cut
-    assert_equal_runs(cut, whole)
+    assert_equal_runs(cut, trained)
     clocks = [read_checkpoint(cut / "checkpoints/last.ckpt")["callbacks"]["WallClock"]["train_s"]]
     assert clocks[0] > epochs_of(cut)[1]["time/train_s"]  # it goes on from where it was
 

@@ -2,6 +2,7 @@
 
 import json
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
@@ -10,7 +11,6 @@ import numpy as np
 import pytest
 import timm
 import torch
-import yaml
 from safetensors.torch import save_file
 
 from mambaloc.rendering import default_intrinsics, embedded_room, embedded_shots, render
@@ -26,27 +26,11 @@ def tool(name, *words):
         runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, scenes):
-    folder = tmp_path_factory.mktemp("run")
-    content = {
-        "model": {"class_path": "LitStudent", "init_args": {"backbone": "resnet10t", "width": 16}},
-        "data": {"root": str(scenes), "scene": "heads", "image_size": 32, "short_side": 36, "validation": "none"},
-        "trainer": {"max_epochs": 1, "accelerator": "cpu", "default_root_dir": str(folder)},
-        "onnx_export": {"enabled": False},
-    }
-    (folder / "recipe.yaml").write_text(yaml.safe_dump(content))
-    tool("train", folder / "recipe.yaml")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def bundle(run):
+def test_a_run_is_exported_verified_and_localises(trained_student, scenes, tmp_path, capsys):
+    run = shutil.copytree(trained_student, tmp_path / "run")
     tool("export", run / "checkpoints/last.ckpt", "--to", "onnx,fp16", "--raw-input")
-    return run / "bundle"
-
-
-def test_a_bundle_is_verified_and_localises(bundle, scenes, tmp_path, capsys):
+    bundle = run / "bundle"
+    capsys.readouterr()
     tool("verify_bundle", bundle)
     said = capsys.readouterr().out
     assert said.count("within bounds") == 2
@@ -80,11 +64,11 @@ def embedded_shot(folder):
     return folder / "shot.png"
 
 
-def test_retrieval_is_measured_on_the_features_a_training_starts_from(run, tmp_path, capsys):
+def test_retrieval_is_measured_on_the_features_a_training_starts_from(trained_student, tmp_path, capsys):
     torch.manual_seed(0)
-    save_file(timm.create_model("resnet10t", num_classes=0).state_dict(), tmp_path / "start.safetensors")
+    save_file(timm.create_model("test_efficientnet", num_classes=0).state_dict(), tmp_path / "start.safetensors")
     weights = ("--model.backbone_weights", tmp_path / "start.safetensors")
-    tool("train", run / "recipe.yaml", *weights, "--trainer.default_root_dir", tmp_path / "run")
+    tool("train", trained_student / "recipe.yaml", *weights, "--trainer.default_root_dir", tmp_path / "run")
     tool("evaluate", tmp_path / "run/checkpoints/last.ckpt", "--retrieval", "--out", tmp_path / "out")
     assert "retrieval mean of 5" in capsys.readouterr().out
     references = json.loads((tmp_path / "out/metrics.json").read_text())["references"]
@@ -93,8 +77,8 @@ def test_retrieval_is_measured_on_the_features_a_training_starts_from(run, tmp_p
     assert said["nearest_training_pose"] <= said["retrieval"]
 
 
-def test_a_checkpoint_is_published(run, tmp_path, capsys):
-    tool("publish", run / "checkpoints/last.ckpt", "--tag", "heads", "--zoo", tmp_path)
+def test_a_checkpoint_is_published(trained_student, tmp_path, capsys):
+    tool("publish", trained_student / "checkpoints/last.ckpt", "--tag", "heads", "--zoo", tmp_path)
     assert str(tmp_path / "student.heads") in capsys.readouterr().out
     assert {p.name for p in (tmp_path / "student.heads").iterdir()} == {
         "manifest.yaml", "weights.safetensors", "README.md",
@@ -114,15 +98,15 @@ def test_a_checkpoint_is_published(run, tmp_path, capsys):
         ("localize", ["nothing.onnx", "0"], "nothing.onnx: no such model"),
         ("localize", ["{run}", "0"], "holds none of model.onnx"),
         ("localize", ["student.embedded_rom", "0"], "did you mean student.embedded_room?"),
-        ("localize", ["{run}/bundle", "nothing.mp4"], "no such file, folder or camera"),
+        ("localize", ["{bundle}", "nothing.mp4"], "no such file, folder or camera"),
         ("publish", ["{run}/recipe.yaml", "--tag", "a"], "recipe.yaml"),
         ("publish", ["{run}/checkpoints/last.ckpt", "--tag", "A B"], "choose another"),
         ("publish", ["nothing.ckpt", "--tag", "a"], "no such checkpoint"),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_code_2(name, words, message, run, bundle, capsys):
+def test_a_mistake_is_one_line_and_exit_code_2(name, words, message, trained_student, bundle_of_pictures, capsys):
     with pytest.raises(SystemExit) as exit_:
-        tool(name, *(word.format(run=run) for word in words))
+        tool(name, *(word.format(run=trained_student, bundle=bundle_of_pictures) for word in words))
     assert exit_.value.code == 2
     error = capsys.readouterr().err
     assert message in error

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation.figures import FIGURES
@@ -28,28 +27,13 @@ def tool(name, *words):
         runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
 
 
-def train(folder, scenes, gis="none", scene="heads", image_size=64):
-    arguments = {"backbone": "resnet10t", "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "gis": gis}
-    content = {
-        "model": {"class_path": "LitTransPoseNet", "init_args": {**arguments, "head_hidden": 16}},
-        "data": {
-            **{"root": str(scenes), "scene": scene, "image_size": image_size, "short_side": 72},
-            **{"validation": "test_set", "batch_size": 8},
-        },
-        "trainer": {"max_epochs": 2, "accelerator": "cpu", "default_root_dir": str(folder)},
-        "best_checkpoint": {"save_top_k": 0},
-        "onnx_export": {"enabled": False},
-    }
-    recipe = folder.with_suffix(".yaml")
-    recipe.write_text(yaml.safe_dump(content))
-    tool("train", recipe)
-    return folder / "checkpoints/last.ckpt"
-
-
 @pytest.fixture(scope="module")
-def checkpoints(tmp_path_factory, scenes):
-    folder = tmp_path_factory.mktemp("runs")
-    return [train(folder / gis, scenes, gis) for gis in ("none", "gis")]
+def checkpoints(trained, tmp_path_factory):
+    """Of a MambaLoc, and of one without GIS that was validated on the test frames."""
+    folder = tmp_path_factory.mktemp("without_gis")
+    words = ["--model.gis", "none", "--data.validation", "test_set", "--best_checkpoint.save_top_k", 0]
+    tool("train", trained.parent / "recipe.yaml", *words, "--trainer.default_root_dir", folder)
+    return [run / "checkpoints/last.ckpt" for run in (trained, folder)]
 
 
 @pytest.mark.slow
@@ -77,16 +61,14 @@ def test_every_kind_is_drawn(kind, checkpoints, tmp_path, capsys):
         (["cumulative", "CHECKPOINT", "--out", "FILE"], "cannot be written"),
     ],
 )
-def test_visualize_used_wrong(words, rule, checkpoints, scenes, tmp_path, capsys):
+def test_visualize_used_wrong(words, rule, trained, trained_student, scenes, tmp_path, capsys):
     (tmp_path / "file").touch()
-    named = {"CHECKPOINT": checkpoints[0], "FILE": tmp_path / "file"}
+    checkpoint, student = (run / "checkpoints/last.ckpt" for run in (trained, trained_student))
+    named = {"CHECKPOINT": checkpoint, "STUDENT": student, "FILE": tmp_path / "file"}
     if "OTHER" in words:
-        named["OTHER"] = train(tmp_path / "other", scenes, image_size=48)
+        named["OTHER"] = enlarged(student, tmp_path)
     if "ELSEWHERE" in words:
-        named["ELSEWHERE"] = moved(checkpoints[0], scenes, tmp_path)
-    if "STUDENT" in words:
-        named["STUDENT"] = train_unwatched(checkpoints[0], tmp_path)
-    capsys.readouterr()
+        named["ELSEWHERE"] = moved(checkpoint, scenes, tmp_path)
     with pytest.raises(SystemExit) as exit_:
         tool("visualize", *(named.get(word, word) for word in words))
     assert exit_.value.code == 2
@@ -105,10 +87,14 @@ def moved(checkpoint, scenes, folder):
     return folder / "moved.ckpt"
 
 
-def train_unwatched(checkpoint, folder):
-    recipe = checkpoint.parent.parent.with_suffix(".yaml")
-    tool("train", recipe, "--data.validation", "none", "--trainer.default_root_dir", folder / "unwatched")
-    return folder / "unwatched/checkpoints/last.ckpt"
+def enlarged(checkpoint, folder):
+    """The same training, as if of larger images, of which a student's weights know nothing."""
+    stored = torch.load(checkpoint, weights_only=True)
+    for part in ("hyper_parameters", "datamodule_hyper_parameters"):
+        stored[part]["image_size"] = 48
+    stored["datamodule_hyper_parameters"]["short_side"] = 72
+    torch.save(stored, folder / "enlarged.ckpt")
+    return folder / "enlarged.ckpt"
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 
 import mambaloc
 from mambaloc.data import PoseDataModule
-from mambaloc.evaluation.evaluate import localise_test_frames
+from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.metrics import summarise
 from mambaloc.zoo import Manifest, list_released
 
@@ -22,11 +22,11 @@ def test_it_is_small_and_in_the_wheel():
 
 
 @pytest.mark.slow
-def test_its_figures_are_found_again(tmp_path):
+def test_its_figures_are_found_again():
     system, manifest = mambaloc.load("student.embedded_room"), Manifest.read(ZOO / "student.embedded_room")
     (result,) = manifest.results
     assert result.data == manifest.scene == "embedded/room"
-    data = PoseDataModule("embedded", str(tmp_path), image_size=system.image_size, short_side=manifest.short_side)
+    data = PoseDataModule("embedded", image_size=system.image_size, short_side=manifest.short_side)
     table = localise_test_frames(system, data, "cpu")
     assert len(table.index) == result.n
     found = summarise(table)

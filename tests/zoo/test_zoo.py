@@ -17,17 +17,12 @@ from mambaloc.zoo.publishing import card, publish
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, scenes):
+def run(trained, tmp_path_factory):
+    """The tiny system on images that are not square."""
     folder = tmp_path_factory.mktemp("run")
-    recipe = folder / "recipe.yaml"
-    model = {"backbone": "resnet10t", "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "head_hidden": 16}
-    data = {"root": str(scenes), "scene": "heads", "image_size": [32, 36], "short_side": 36, "validation": "sequences"}
-    trainer = {"max_epochs": 2, "accelerator": "cpu", "default_root_dir": str(folder / "run")}
-    system = {"class_path": "LitMambaLoc", "init_args": {**model, "normalise_position": True}}
-    content = {"model": system, "data": data, "trainer": trainer, "onnx_export": {"enabled": False}}
-    recipe.write_text(yaml.safe_dump(content))
-    main([str(recipe)])
-    return folder / "run"
+    words = ["--data.image_size", "[32, 36]", "--trainer.default_root_dir", str(folder)]
+    main([str(trained.parent / "recipe.yaml"), *words])
+    return folder
 
 
 @pytest.fixture(scope="module")

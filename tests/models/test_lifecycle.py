@@ -1,31 +1,17 @@
-"""Every registered system through its whole life, in every GIS mode."""
+"""Every registered system through its whole life, in every GIS mode: built, trained, saved and loaded."""
 
-import inspect
-from dataclasses import replace
 from fnmatch import fnmatch
 
 import lightning as L
 import pytest
 import torch
-from torch import Tensor, nn
+from systems import EVERY, flat, frames, small
+from torch import nn
 from torch.utils.data import DataLoader
 
 import mambaloc
-from mambaloc.benchmark.latency import random_frames
 from mambaloc.errors import InputError
-from mambaloc.export import contract_of, export_onnx
-from mambaloc.models import LitPoseRegressor
-from mambaloc.models.registry import model_class
 from mambaloc.nn import MambaMixer
-from mambaloc.types import PoseBatch, PosePrediction
-from mambaloc.uncertainty import ErrorsByDistance, UncertaintyHead, seen_of
-
-# What makes a system small and quick; each takes those arguments that it has.
-SMALL = {
-    "encoder_layers": 1, "dim": 32, "heads": 4, "feedforward": 32, "head_hidden": 32, "width": 64, "hidden": 16,
-    "stage_channels": 64, "blocks": 2, "groups": 4,
-}  # fmt: skip
-SIDE = 64
 
 # Parameters that no loss can reach, and why.
 UNTRAINED = {
@@ -33,38 +19,6 @@ UNTRAINED = {
     "classical": ("*.mixer.A_log",),  # from a zero state nothing decays
     "gis": (),
 }
-
-CELLS = [(name, gis) for name in mambaloc.list_models() for gis in ("none", "classical", "gis")]
-EVERY = pytest.mark.parametrize(("name", "gis"), CELLS)
-EACH_ONCE = pytest.mark.parametrize("name", mambaloc.list_models())
-
-
-def small(name: str, gis: str, seed: int = 0, **kwargs) -> LitPoseRegressor:
-    taken = {
-        p
-        for c in model_class(name).__mro__
-        if issubclass(c, L.LightningModule)
-        for p in inspect.signature(c).parameters
-    }
-    torch.manual_seed(seed)
-    return mambaloc.create_model(
-        name,
-        gis=gis,
-        image_size=SIDE,
-        backbone="mobilenetv3_small_050",
-        **{k: v for k, v in SMALL.items() if k in taken},
-        **kwargs,
-    )
-
-
-def frames(count: int = 3, seed: int = 0) -> PoseBatch:
-    coarse = torch.rand(count, 3, 4, 4, generator=torch.Generator().manual_seed(seed))
-    smooth = torch.nn.functional.interpolate(coarse, size=(SIDE, SIDE), mode="bilinear")
-    return replace(random_frames(count, SIDE, seed=seed), image=smooth)  # noise in every pixel looks all the same
-
-
-def flat(prediction: PosePrediction) -> Tensor:
-    return torch.cat((prediction.position_m, prediction.quaternion), dim=-1)
 
 
 @EVERY
@@ -103,6 +57,18 @@ def test_evaluation_has_no_dropout_and_no_memory(name, gis):
 
 @EVERY
 @torch.no_grad()
+def test_forward_is_its_parts_one_after_another(name, gis):
+    network, image = small(name, gis).eval().network, frames().image
+    expected = flat(network(image))
+    branches = network.forward_features(image)
+    assert [feature.shape for feature in branches] == [(3, branches[0].shape[-1])] * 2
+    assert torch.equal(flat(network.forward_head(branches)), expected)
+    again = network.features(network.forward_backbone(image))
+    assert all(torch.equal(*pair) for pair in zip(again, branches, strict=True))
+
+
+@EVERY
+@torch.no_grad()
 def test_a_seed_determines_the_system(name, gis):
     first, again, other = (small(name, gis, seed=seed).eval() for seed in (3, 3, 4))
     assert all(torch.equal(v, again.state_dict()[k]) for k, v in first.state_dict().items())
@@ -131,21 +97,6 @@ def test_checkpoint_round_trip(name, gis, tmp_path):
         with torch.no_grad():
             assert torch.equal(flat(loaded.eval()(batch.image)), flat(system(batch.image)))
     assert loaded.provenance["model"] == name
-
-
-@pytest.mark.slow
-@EACH_ONCE
-def test_onnx_runtime_agrees(name, tmp_path):
-    system = small(name, "gis")
-    with torch.no_grad():
-        uncertainty = UncertaintyHead(seen_of(system.network.eval(), [frames(4).image]))
-    uncertainty.calibrate(ErrorsByDistance(*torch.rand(3, 20) + 0.1), 0.9)
-    contract = contract_of(system, {"dataset": "7scenes", "scene": "heads", "short_side": SIDE}, uncertainty)
-    path = tmp_path / "model.onnx"
-    parity = export_onnx(system, path, contract, uncertainty, tolerance_m=1e-4, tolerance_deg=0.01)
-    assert path.is_file()
-    assert parity.position_m < 1e-4
-    assert parity.uncertainty < 1e-3
 
 
 @EVERY
@@ -177,35 +128,3 @@ def test_what_needs_the_scene_says_so(tmp_path):
     trainer = L.Trainer(default_root_dir=tmp_path, accelerator="cpu", max_epochs=1, logger=False)
     with pytest.raises(InputError, match=r"model\.normalise_position: needs the scene; give the trainer a Pose"):
         trainer.fit(small("student", "none", normalise_position=True), DataLoader([frames()], batch_size=None))
-
-
-def learned_by_heart(name: str, start: nn.Module | None = None, lr: float = 3e-3, steps: int = 300) -> LitPoseRegressor:
-    """Train on eight frames without dropout at a falling rate: the median errors end under 5 cm and 3 degrees.
-
-    The errors are those of the last step: batch norm's running statistics of so few pixels are others than a batch's.
-    """
-    system, batch = small(name, "gis", lr=lr, dropout=0.0, weight_decay=0.0), frames(8)
-    if start is not None:
-        system.network.load_state_dict(start.state_dict())
-    optimizer = system.configure_optimizers()["optimizer"]
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=steps)
-    system.train()
-    for _ in range(steps):
-        prediction = system(batch.image)
-        optimizer.zero_grad()
-        system.loss(prediction, batch).backward()
-        optimizer.step()
-        schedule.step()
-    system.val_errors.update(prediction, batch)
-    errors = system.val_errors.compute()
-    assert errors["position_error_m"] < 0.05
-    assert errors["rotation_error_deg"] < 3
-    return system
-
-
-@pytest.mark.slow
-@EACH_ONCE
-def test_eight_frames_can_be_learned_by_heart(name):
-    # From afar the reprojection error is clipped and flat: it starts from learned weights, as its recipe does.
-    start = learned_by_heart("posenet_learned").network if name == "posenet_geometric" else None
-    learned_by_heart(name, start, lr=1e-4 if start else 3e-3)

@@ -1,0 +1,90 @@
+"""Trained weights: read from checkpoints without unpickling, put into networks and systems, counted."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+from pathlib import Path
+from typing import Any, TypeVar
+
+import lightning as L
+import torch
+from torch import nn
+
+from mambaloc.errors import InputError
+
+_System = TypeVar("_System", bound=L.LightningModule)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint's plain data onto the CPU.
+
+    Raises:
+        InputError: where the file is missing, unreadable, or holds anything but tensors and plain data.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such checkpoint; a training run writes them to RUN/checkpoints/")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        reason = next((line for line in str(error).splitlines() if "GLOBAL" in line), "not plain tensors").strip()
+        raise InputError(f"{path}: refused, since loading it could run code ({reason}); use a trusted export") from None
+    except Exception as error:  # torch's unpickler fails on broken files with KeyError, IndexError, struct.error, ...
+        raise InputError(f"{path}: not a readable checkpoint ({type(error).__name__}); is it complete?") from None
+    ours = checkpoint.get("mambaloc") if isinstance(checkpoint, dict) else None
+    if not isinstance(ours, dict) or "model" not in ours:
+        raise InputError(f"{path}: not a MambaLoc checkpoint; give one that a training run wrote")
+    return checkpoint
+
+
+def start_from(network: nn.Module, path: str | Path) -> None:
+    """Copy the weights of a checkpoint's network.
+
+    Raises:
+        InputError: where there is no such checkpoint, or its network is another one.
+    """
+    prefix = "network."
+    try:
+        state = read_checkpoint(path)["state_dict"]
+    except InputError as error:
+        raise InputError(f"model.warm_start: {error}; train it first, or set it to null") from None
+    try:
+        network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise InputError(
+            f"model.warm_start: {path}: its network is another one ({reason}); "
+            "train that with this recipe's model arguments"
+        ) from None
+
+
+def build_from(stored: dict[str, Any], cls: type[_System], **changed: Any) -> _System:
+    """Build a trained system on the CPU.
+
+    Backbone weights are in the checkpoint, so whatever started the training is not looked for again.
+
+    Args:
+        stored: what :func:`read_checkpoint` returned.
+        cls: the system's class.
+        changed: hyperparameters that replace the stored ones.
+    """
+    # Without Lightning's own notes on the class: which one to build is not the file's to say.
+    arguments = {name: value for name, value in stored.get("hyper_parameters", {}).items() if not name.startswith("_")}
+    arguments |= dict.fromkeys({"backbone_weights", "warm_start"} & set(arguments)) | changed
+    taken = inspect.signature(cls).parameters
+    if not any(each.kind is each.VAR_KEYWORD for each in taken.values()):  # else a base class takes the others
+        arguments = {name: value for name, value in arguments.items() if name in taken}
+    system = cls(**arguments)
+    system.on_load_checkpoint(stored)
+    system.load_state_dict(stored["state_dict"])
+    return system
+
+
+def parameter_count(network: nn.Module) -> int:
+    """Count the trainable parameters."""
+    return sum(p.numel() for p in network.parameters() if p.requires_grad)
+
+
+def mib(parameters: int) -> float:
+    """Size of so many parameters as float32, in MiB: what the paper prints as "Mb"."""
+    return parameters * 4 / 2**20
