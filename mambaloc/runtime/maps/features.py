@@ -18,7 +18,6 @@ DESCRIPTOR_SCALE = 512.0
 
 _MOST_KEYPOINTS = 1000
 _CONTRAST = 0.02  # half of OpenCV's default: small pictures have few keypoints
-_SIGMA = 1.3  # of the finest scale; OpenCV's 1.6 finds a sixth fewer
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def detect_features(image: Image, intrinsics: ArrayLike, scale: float) -> Featur
     if size != (width, height):
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     # The precise upscale puts keypoints where they are; otherwise each is 0.25 px to the lower right.
-    sift = cv2.SIFT.create(_MOST_KEYPOINTS, contrastThreshold=_CONTRAST, sigma=_SIGMA, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(_MOST_KEYPOINTS, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey, None)
     small = rescaled_intrinsics(intrinsics, (width, height), size)
     if not keypoints:
