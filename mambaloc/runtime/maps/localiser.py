@@ -108,7 +108,7 @@ class MapLocaliser:
         pose = ransac_pose(self._points_m[best[is_clear]], features.rays[is_clear], near, rng)
         if pose is None:
             return _nowhere()
-        scale = near  # of the refinement; finer where the matches are
+        scale = near / 2  # of the refinement; finer where the matches are
         for window in _WINDOWS:
             keypoints, points = self._search(features, pose, window * near)
             if len(points) < 4:
@@ -116,7 +116,7 @@ class MapLocaliser:
             seen_m, rays = self._points_m[points], features.rays[keypoints]
             pose, covariance = refine_pose(pose, seen_m, rays, scale)
             off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
-            scale = min(near, max(5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
+            scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
         inliers = int((off <= near).sum())
         deviation_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])  # in the direction that is least sure
         is_accepted = inliers >= self.map.least_inliers and bool(deviation_m <= _MOST_DEVIATION * self._unit_m)
