@@ -106,7 +106,7 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
         points[kept].astype(np.float32),
         quantized(descriptors[kept]),
         np.packbits(views[kept], axis=1),
-        key.world_from_cam,
+        np.array(key.world_from_cam, np.float64),
         features[0].size,
         features[0].intrinsics,
         settings.least_inliers,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -50,8 +51,8 @@ class MapErrors:
         return {
             "position_error_m": float(np.median(self.position_m)),
             "rotation_error_deg": float(np.median(self.rotation_deg)),
-            "position_error_mean_m": float(self.position_m[has_pose].mean()),
-            "rotation_error_mean_deg": float(self.rotation_deg[has_pose].mean()),
+            "position_error_mean_m": _mean(self.position_m[has_pose]),
+            "rotation_error_mean_deg": _mean(self.rotation_deg[has_pose]),
             "position_error_worst_m": float(self.position_m.max()),
             "without_pose": float((~has_pose).mean()),
             "above_20cm": float((self.position_m > _WRONG[0]).mean()),
@@ -107,7 +108,7 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
     Writes ``map.npz`` and ``metrics.json``.
 
     Returns:
-        What ``metrics.json`` holds.
+        What ``metrics.json`` holds, with infinity where that has null.
 
     Raises:
         InputError: as :func:`read_frames` and :func:`~mambaloc.mapping.building.build_map`, and for a folder that
@@ -149,8 +150,10 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
             "seconds_are": "core_seconds and query_cpu_ms are CPU time of the process",
         },
     }
+    # JSON has no infinity, which the worst error is where a frame has no pose.
+    finite = {name: value if math.isfinite(value) else None for name, value in errors.summary().items()}
     with writing(out), whole_file(out / "metrics.json") as partial:
-        partial.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps({**result, "metrics": finite}, indent=2) + "\n", encoding="utf-8")
     return result
 
 
@@ -164,6 +167,10 @@ def describe(result: dict[str, Any]) -> str:
         f"{100 * metrics['recall_10cm_5deg']:.1f} % within 10 cm 5 deg, {made['mib']:.2f} MiB, "
         f"{made['core_seconds']:.1f} core-seconds, {metrics['query_cpu_ms']:.0f} ms a query"
     )
+
+
+def _mean(errors: Floats) -> float:
+    return float(errors.mean()) if len(errors) else math.inf
 
 
 def _world_from_cam(frames: Frames) -> Floats:
