@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -197,3 +199,8 @@ def test_frames_may_be_files(walk, tmp_path):
     expected = build_map(frames, SETTINGS, "room")
     found = build_map(PosedFrames(files, frames.intrinsics, frames.world_from_cam), SETTINGS, "room")
     np.testing.assert_array_equal(found.points_m, expected.points_m)
+
+
+def test_maps_are_built_and_used_without_torch():
+    code = "import sys; import mambaloc.mapping, mambaloc.runtime.maps; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
