@@ -22,7 +22,7 @@ from mambaloc.rendering.trajectories import smooth_trajectory
 
 REPOSITORY = Path(__file__).parents[2]
 
-RECIPES = sorted((REPOSITORY / "recipes").glob("*.yaml"))
+RECIPES = sorted({*(REPOSITORY / "recipes").glob("*.yaml")} - {*(REPOSITORY / "recipes").glob("map_*.yaml")})
 BLOCKS = REPOSITORY / "recipes/overlays/redkitchen_blocks.yaml"
 OVERLAYS = sorted({*BLOCKS.parent.glob("*.yaml")} - {BLOCKS, BLOCKS.with_name("gpu.yaml")})  # see test_gpu.py
 

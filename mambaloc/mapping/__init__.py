@@ -1,0 +1,5 @@
+"""Sparse maps from posed frames; what reads datasets is in ``recipe`` and ``evaluating``."""
+
+from mambaloc.mapping.building import MapSettings, PosedFrames, build_map
+
+__all__ = ["MapSettings", "PosedFrames", "build_map"]

@@ -1,0 +1,179 @@
+"""A map measured on the test frames of its scene."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from mambaloc import provenance
+from mambaloc.data.cameras import frame_intrinsics
+from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
+from mambaloc.data.frames import BadFrames, Frames, Split
+from mambaloc.files import sha256, whole_file, writing
+from mambaloc.images import read_image
+from mambaloc.mapping.building import PosedFrames, build_map
+from mambaloc.mapping.recipe import MapRecipe
+from mambaloc.runtime.maps import MapLocaliser, SparseMap
+from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_error_deg
+
+Floats = NDArray[np.float64]
+
+_WITHIN = (0.1, 5.0)  # metres and degrees
+_WRONG = (0.2, 5.0)
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """How a map localised frames, a row a frame and RANSAC seed.
+
+    Shape:
+        all (N,): errors are infinite where there was no pose.
+    """
+
+    position_m: Floats
+    rotation_deg: Floats
+    is_accepted: NDArray[np.bool_]
+    cpu_s: Floats
+
+    def summary(self) -> dict[str, float]:
+        """Medians count frames without a pose as infinitely wrong; means leave them out."""
+        has_pose, wrong = np.isfinite(self.position_m), ~self._within(*_WRONG)
+        return {
+            "position_error_m": float(np.median(self.position_m)),
+            "rotation_error_deg": float(np.median(self.rotation_deg)),
+            "position_error_mean_m": _mean(self.position_m[has_pose]),
+            "rotation_error_mean_deg": _mean(self.rotation_deg[has_pose]),
+            "position_error_worst_m": float(self.position_m.max()),
+            "without_pose": float((~has_pose).mean()),
+            "above_20cm": float((self.position_m > _WRONG[0]).mean()),
+            "recall_5cm_5deg": float(self._within(0.05, 5).mean()),
+            "recall_10cm_5deg": float(self._within(*_WITHIN).mean()),
+            "accepted": float(self.is_accepted.mean()),
+            "accepted_and_wrong": float((wrong & self.is_accepted).sum() / max(self.is_accepted.sum(), 1)),
+            "query_cpu_ms": float(1000 * self.cpu_s.mean()),
+        }
+
+    def _within(self, position_m: float, rotation_deg: float) -> NDArray[np.bool_]:
+        return (self.position_m <= position_m) & (self.rotation_deg <= rotation_deg)
+
+
+def read_frames(recipe: MapRecipe, split: Split) -> PosedFrames:
+    """Read a split of a recipe's scene with its cameras.
+
+    Raises:
+        InputError: for a scene that cannot be read, or whose cameras are unknown.
+    """
+    dataset, root, scene = locate(recipe.dataset, recipe.root, recipe.scene)
+    folder = scene_folder(dataset, Path(root) if root else None, scene)
+    frames = DATASETS[dataset].read_split(folder, split, BadFrames())
+    return PosedFrames(frames.image_paths, frame_intrinsics(dataset, folder, frames), _world_from_cam(frames))
+
+
+def measure(sparse_map: SparseMap, frames: PosedFrames, seeds: Sequence[int]) -> MapErrors:
+    """Localise frames in a map, once a seed; time is this process's own on all cores, without decoding the picture."""
+    localisers = [MapLocaliser(sparse_map, seed) for seed in seeds]
+    rows = []
+    for image, intrinsics, truth in track(
+        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True),
+        "queries  ",
+        len(frames),
+        transient=True,
+    ):
+        rgb = read_image(image) if isinstance(image, Path) else image
+        for localiser in localisers:
+            start = time.process_time()
+            found = localiser.localise(rgb, intrinsics)
+            taken_s = time.process_time() - start
+            off_m = np.linalg.norm(found.position_m - truth[:3, 3])
+            off_deg = rotation_error_deg(found.quaternion, quaternion_from_matrix(truth[:3, :3]))
+            rows.append((off_m, off_deg, found.is_accepted, taken_s))
+    position_m, rotation_deg, is_accepted, cpu_s = (np.array(each) for each in zip(*rows, strict=True))
+    position_m, rotation_deg = (np.where(np.isnan(each), np.inf, each) for each in (position_m, rotation_deg))
+    return MapErrors(position_m, rotation_deg, is_accepted, cpu_s)
+
+
+def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
+    """Build a recipe's map from its training frames, measure it on its test frames, and write both to a folder.
+
+    Writes ``map.npz`` and ``metrics.json``.
+
+    Returns:
+        What ``metrics.json`` holds, with infinity where that has null.
+
+    Raises:
+        InputError: as :func:`read_frames` and :func:`~mambaloc.mapping.building.build_map`, and for a folder that
+            cannot be written.
+    """
+    train, test = read_frames(recipe, "train"), read_frames(recipe, "test")
+    name = recipe.label or Path(recipe.scene).name
+    started, cpu = time.perf_counter(), time.process_time()
+    sparse_map = build_map(train, recipe.settings, name)
+    core_seconds = time.process_time() - cpu
+    sparse_map.save(out / "map.npz")
+    errors = measure(sparse_map, test, recipe.ransac_seeds)
+    result = {
+        "metrics": errors.summary(),
+        "label": name,
+        "split": "test",
+        "count": len(test),
+        "ransac_seeds": list(recipe.ransac_seeds),
+        "data": {
+            "dataset": recipe.dataset,
+            "scene": recipe.scene,
+            "train_frames": len(train),
+            "test_frames": len(test),
+        },
+        "map": {
+            "settings": asdict(recipe.settings),
+            "points": len(sparse_map),
+            "mib": (out / "map.npz").stat().st_size / 2**20,
+            "sha256": sha256(out / "map.npz"),
+            "digests": sparse_map.digests,
+            "core_seconds": core_seconds,
+        },
+        "evaluation": {
+            "commit": provenance.commit(),
+            "versions": provenance.versions(),
+            "device": provenance.device_name(),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "seconds": round(time.perf_counter() - started, 3),
+            "seconds_are": "core_seconds and query_cpu_ms are CPU time of the process",
+        },
+    }
+    # JSON has no infinity, which the worst error is where a frame has no pose.
+    finite = {name: value if math.isfinite(value) else None for name, value in errors.summary().items()}
+    with writing(out), whole_file(out / "metrics.json") as partial:
+        partial.write_text(json.dumps({**result, "metrics": finite}, indent=2) + "\n", encoding="utf-8")
+    return result
+
+
+def describe(result: dict[str, Any]) -> str:
+    """A result in one line."""
+    metrics, made = result["metrics"], result["map"]
+    return (
+        f"{result['label']}: median {metrics['position_error_m']:.3f} m / {metrics['rotation_error_deg']:.2f} deg, "
+        f"mean {metrics['position_error_mean_m']:.3f} / {metrics['rotation_error_mean_deg']:.2f}, "
+        f"worst {metrics['position_error_worst_m']:.2f} m, "
+        f"{100 * metrics['recall_10cm_5deg']:.1f} % within 10 cm 5 deg, {made['mib']:.2f} MiB, "
+        f"{made['core_seconds']:.1f} core-seconds, {metrics['query_cpu_ms']:.0f} ms a query"
+    )
+
+
+def _mean(errors: Floats) -> float:
+    return float(errors.mean()) if len(errors) else math.inf
+
+
+def _world_from_cam(frames: Frames) -> Floats:
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = matrix_from_quaternion(frames.quaternion), frames.position_m
+    return poses

@@ -1,0 +1,30 @@
+"""Key frames: those of a capture that together cover it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mambaloc.runtime.maps.viewpoints import spread_m, viewpoints
+
+
+def farthest_first(world_from_cam: ArrayLike, count: int) -> NDArray[np.int64]:
+    """Choose key frames by coverage: each is the farthest, in position and direction, from those before it.
+
+    The first is the one nearest to the middle of all.
+
+    Args:
+        world_from_cam: (N, 4, 4).
+        count: so many at most.
+
+    Returns:
+        Rows in ascending order, (min(count, N),).
+    """
+    places = viewpoints(world_from_cam, spread_m(world_from_cam))
+    chosen = [int(((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin())]
+    nearest = np.full(len(places), np.inf)
+    while len(chosen) < min(count, len(places)):
+        nearest = np.minimum(nearest, ((places - places[chosen[-1]]) ** 2).sum(axis=1))
+        nearest[chosen] = -1
+        chosen.append(int(nearest.argmax()))
+    return np.sort(np.array(chosen, np.int64))

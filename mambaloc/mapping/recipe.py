@@ -1,0 +1,66 @@
+"""Which frames a map is built from, how, and how it is measured: a small YAML file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mambaloc.errors import InputError
+from mambaloc.files import read_yaml
+from mambaloc.mapping.building import MapSettings
+
+
+@dataclass(frozen=True)
+class MapRecipe:
+    """A scene and the settings of its map.
+
+    Args:
+        scene: name of a dataset's scene, or the path of an imported one.
+        dataset: as :class:`~mambaloc.data.PoseDataModule` takes it.
+        root: likewise.
+        label: how results call these frames; the scene's name unless given.
+        settings: how the map is built.
+        ransac_seeds: each test frame is localised once with each.
+    """
+
+    scene: str
+    dataset: str = "7scenes"
+    root: str | None = None
+    label: str | None = None
+    settings: MapSettings = field(default_factory=MapSettings)
+    ransac_seeds: tuple[int, ...] = (0, 1, 2)
+
+
+_TYPES = {"scene": str, "dataset": str, "root": str, "label": str}
+_LEAST = {"key_frames": 2, "width": 32, "most_bytes": 1000, "least_inliers": 4, "seed": 0}
+
+
+def read_recipe(path: Path) -> MapRecipe:
+    """Read a recipe.
+
+    Raises:
+        InputError: for a file that cannot be read, a key that is unknown, or a value of another kind.
+    """
+    data = read_yaml(path, "give a recipe, or an imported scene's folder", "correct it")
+    if not isinstance(data, dict) or not isinstance(data.get("scene"), str):
+        raise InputError(f"{path}: does not name a scene. Add 'scene: NAME'.")
+    for key, value in data.items():
+        if key in _TYPES:
+            fits, what = isinstance(value, str), "a text"
+        elif key in _LEAST:
+            fits, what = _is_int(value, _LEAST[key]), f"a whole number of {_LEAST[key]} or more"
+        elif key == "ransac_seeds":
+            fits = isinstance(value, list) and len(value) > 0 and all(_is_int(seed, 0) for seed in value)
+            what = "a list of whole numbers"
+        else:
+            known = ", ".join((*_TYPES, *_LEAST, "ransac_seeds"))
+            raise InputError(f"{path}: {key!r} is unknown. Choose among {known}.")
+        if not fits:
+            raise InputError(f"{path}: {key} is {str(value)[:40]!r}. Give {what}.")
+    settings = MapSettings(**{key: value for key, value in data.items() if key in _LEAST})
+    texts = {key: value for key, value in data.items() if key in _TYPES}
+    return MapRecipe(**texts, settings=settings, ransac_seeds=tuple(data.get("ransac_seeds", (0, 1, 2))))
+
+
+def _is_int(value: object, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least

@@ -1,0 +1,113 @@
+"""The pose of a camera from points and where it sees them: RANSAC, Levenberg-Marquardt, and a covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+
+_TRIALS = 1000
+_CONFIDENCE = 0.9999
+_STEPS = 10
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """``world_from_cam``: ``rotation`` (3, 3) and ``position_m`` (3,), the camera's centre."""
+
+    rotation: Floats
+    position_m: Floats
+
+    def project(self, points_m: Floats) -> tuple[Floats, Floats]:
+        """Points (M, 3) in the plane at depth 1, (M, 2), and their depths (M,); NaN where these are not positive."""
+        cam = (points_m - self.position_m) @ self.rotation
+        depth = np.where(cam[:, 2] > 1e-9, cam[:, 2], np.nan)
+        return cam[:, :2] / depth[:, None], depth
+
+
+def ransac_pose(points_m: Floats, rays: Floats, near: float, rng: np.random.Generator) -> CameraPose | None:
+    """Find the pose that most matches agree with, by RANSAC, and SQPnP on those; None where there is none.
+
+    Args:
+        points_m: (M, 3).
+        rays: where they are seen in the plane at depth 1, (M, 2).
+        near: how far from its ray, in that plane, a point agrees.
+        rng: shuffles the matches, since OpenCV draws from them by a seed of its own.
+    """
+    if len(points_m) < 4:
+        return None
+    order = rng.permutation(len(points_m))
+    try:
+        is_found, rotation, shift, inliers = cv2.solvePnPRansac(
+            points_m[order], rays[order], np.eye(3), None,
+            iterationsCount=_TRIALS, reprojectionError=near, confidence=_CONFIDENCE, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:  # matches that are all one point, or on a line
+        return None
+    if not is_found or inliers is None or not np.isfinite(rotation).all() or not np.isfinite(shift).all():
+        return None
+    cam_from_world = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
+    return CameraPose(cam_from_world.T, -cam_from_world.T @ shift[:, 0])
+
+
+def refine_pose(start: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[CameraPose, Floats]:
+    """Least squares of all matches with Cauchy's weights, by Levenberg-Marquardt, and the covariance of the solution.
+
+    Args:
+        start: a pose from which the points lie in front.
+        points_m: (M, 3), M of 4 or more.
+        rays: (M, 2) in the plane at depth 1.
+        near: a match that is off by half of it has half the weight.
+
+    Returns:
+        The pose, and its covariance (6, 6): of the position in metres, then of the rotation in radians about the fixed
+        axes of the world (``R = exp(θ) R_estimated``), as ROS's PoseWithCovariance has it. It is the inverse of the
+        normal equations times the weighted variance of the residuals.
+    """
+    pose, damping = start, 1e-4
+    cost, normal, right, spread = _normal_equations(pose, points_m, rays, near)
+    for _ in range(_STEPS):
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6), right)
+        moved = _moved(pose, step)
+        new = _normal_equations(moved, points_m, rays, near)
+        if new[0] <= cost:
+            has_converged = cost - new[0] <= 1e-6 * cost
+            pose, damping, (cost, normal, right, spread) = moved, damping / 10, new
+            if has_converged:
+                break
+        else:
+            damping *= 10
+    return pose, np.linalg.pinv(normal, hermitian=True) * spread
+
+
+def _moved(pose: CameraPose, step: Floats) -> CameraPose:
+    return CameraPose(cv2.Rodrigues(step[3:])[0] @ pose.rotation, pose.position_m + step[:3])
+
+
+def _normal_equations(
+    pose: CameraPose, points_m: Floats, rays: Floats, near: float
+) -> tuple[float, Floats, Floats, float]:
+    """Cost, ``J^T W J`` (6, 6), ``-J^T W r`` (6,), and the weighted variance of the residuals."""
+    towards = points_m - pose.position_m
+    cam = towards @ pose.rotation
+    if (cam[:, 2] <= 1e-9).any():
+        return np.inf, np.eye(6), np.zeros(6), np.inf
+    seen = cam[:, :2] / cam[:, 2:]
+    off = (seen - rays) * (2 / near)
+    square = (off**2).sum(axis=1)
+    weight = 1 / (1 + square)
+    # d seen / d cam, carried into the world; a turn by θ about the world's axes moves a point by -θ x towards.
+    slope = (pose.rotation.T[:2] - seen[..., None] * pose.rotation.T[2]) * (2 / near / cam[:, 2])[:, None, None]
+    jacobian = np.concatenate((-slope, slope @ (towards @ _CROSS).reshape(-1, 3, 3)), axis=-1).reshape(-1, 6)
+    weighted = (jacobian * np.repeat(weight, 2)[:, None]).T
+    spread = float(weight @ square) / max(2 * len(off) - 6, 1)
+    return float(np.log1p(square).sum()), weighted @ jacobian, -weighted @ off.ravel(), spread
+
+
+_CROSS = -np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
+"""``s @ (d @ _CROSS).reshape(3, 3)`` is ``s x d``."""

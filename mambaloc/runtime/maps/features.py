@@ -1,0 +1,156 @@
+"""SIFT keypoints with RootSIFT descriptors, and how descriptors are compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.images import Image
+
+Floats = NDArray[np.float64]
+
+DESCRIPTOR_SCALE = 512.0
+"""A stored descriptor is the unit vector times this, rounded and cut to 0..255, as COLMAP has it."""
+
+_MOST_KEYPOINTS = 1000
+_CONTRAST = 0.02  # half of OpenCV's default: small pictures have few keypoints
+
+
+@dataclass(frozen=True)
+class Features:
+    """Keypoints of one picture.
+
+    Shape:
+        ``pixels`` (N, 2) in the picture as it was searched; ``descriptors`` (N, 128) float32 of unit length.
+
+    Args:
+        pixels: the centre of the top-left pixel is (0, 0).
+        descriptors: RootSIFT, so that their product is the Bhattacharyya coefficient of two histograms.
+        intrinsics: (3, 3) pinhole matrix of the picture as it was searched.
+        size: its (width, height).
+    """
+
+    pixels: Floats
+    descriptors: NDArray[np.float32]
+    intrinsics: Floats
+    size: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def rays(self) -> Floats:
+        """Where keypoints lie in the plane at depth 1, (N, 2)."""
+        return normalized(self.pixels, self.intrinsics)
+
+    @property
+    def corner_rays(self) -> Floats:
+        """The same of the picture's upper left and lower right corner, (2, 2)."""
+        return normalized([(-0.5, -0.5), (self.size[0] - 0.5, self.size[1] - 0.5)], self.intrinsics)
+
+
+def detect_features(image: Image, intrinsics: ArrayLike, scale: float) -> Features:
+    """Find the keypoints of a picture once it is made smaller.
+
+    Args:
+        image: RGB (H, W, 3), ``uint8``, without distortion.
+        intrinsics: (3, 3) pinhole matrix of it.
+        scale: width of the smaller picture over that of the picture; 1 at most counts.
+
+    Raises:
+        InputError: where the intrinsics do not fit the picture.
+    """
+    height, width = image.shape[:2]
+    check_intrinsics(intrinsics, (width, height))
+    grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    size = (max(1, round(width * min(scale, 1))), max(1, round(height * min(scale, 1))))
+    if size != (width, height):
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    # The precise upscale puts keypoints where they are; otherwise each is 0.25 px to the lower right.
+    sift = cv2.SIFT.create(_MOST_KEYPOINTS, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(grey, None)
+    small = rescaled_intrinsics(intrinsics, (width, height), size)
+    if not keypoints:
+        return Features(np.empty((0, 2)), np.empty((0, 128), np.float32), small, size)
+    root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1))
+    return Features(np.array([point.pt for point in keypoints]), root.astype(np.float32), small, size)
+
+
+def rescaled_intrinsics(intrinsics: ArrayLike, size: tuple[int, int], new_size: tuple[int, int]) -> Floats:
+    """The (3, 3) pinhole matrix once a picture of ``size`` (width, height) is resized; corners stay corners."""
+    x, y = new_size[0] / size[0], new_size[1] / size[1]
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]]) @ np.asarray(intrinsics, np.float64)
+
+
+def check_intrinsics(intrinsics: ArrayLike, size: tuple[int, int]) -> None:
+    """Refuse a matrix that cannot be the camera of a picture of ``size`` (width, height).
+
+    Raises:
+        InputError: where it is not a pinhole matrix, its centre lies outside of the picture, or the picture would be
+            less than 6 or more than 160 degrees wide.
+    """
+    matrix = np.asarray(intrinsics, np.float64)
+    fits = matrix.shape == (3, 3) and np.isfinite(matrix).all() and np.allclose(matrix[2], (0, 0, 1))
+    if fits:
+        focal, centre = np.diag(matrix)[:2] / size[0], matrix[:2, 2] / size
+        fits = bool((focal > 0.09).all() and (focal < 10).all() and (centre > 0).all() and (centre < 1).all())
+    if not fits:
+        numbers = np.array2string(matrix, precision=1, separator=" ").replace("\n", "")
+        raise InputError(
+            f"intrinsics {numbers}: cannot be the camera of a picture of {size[0]}x{size[1]}; give fx, fy, cx and cy "
+            "in pixels of that picture"
+        )
+
+
+def normalized(pixels: ArrayLike, intrinsics: ArrayLike) -> Floats:
+    """Pixels (..., 2) to where their rays meet the plane at depth 1, (..., 2)."""
+    inverse = np.linalg.inv(np.asarray(intrinsics, np.float64))
+    return np.asarray(pixels, np.float64) @ inverse[:2, :2].T + inverse[:2, 2]
+
+
+def quantized(descriptors: ArrayLike) -> NDArray[np.uint8]:
+    """Unit descriptors as bytes; (..., 128) -> (..., 128)."""
+    return np.clip(np.rint(np.asarray(descriptors) * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8)
+
+
+def dequantized(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The unit descriptors that bytes stand for; (..., 128) -> (..., 128)."""
+    floats = descriptors.astype(np.float32)
+    return floats / np.maximum(np.linalg.norm(floats, axis=-1, keepdims=True), 1)
+
+
+def distance(similarity: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Euclidean distance of unit vectors from their product."""
+    return np.sqrt(np.maximum(2 - 2 * similarity, 0))
+
+
+def unambiguous(similarity_NM: NDArray[np.float32], ratio: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Each row's best column, and whether it is clearly nearer than the second best (Lowe's ratio test).
+
+    Args:
+        similarity_NM: products of unit descriptors.
+        ratio: of the two distances, below which the best counts.
+
+    Returns:
+        Columns (N,) and whether each counts (N,); none does where there are fewer than two columns.
+    """
+    rows = np.arange(len(similarity_NM))
+    if similarity_NM.shape[1] < 2:
+        return np.zeros(len(rows), np.int64), np.zeros(len(rows), bool)
+    best = similarity_NM.argmax(axis=1)
+    first = similarity_NM[rows, best]
+    similarity_NM[rows, best] = -1  # rather than a copy of what may be large
+    second = similarity_NM.max(axis=1)
+    similarity_NM[rows, best] = first
+    return best, distance(first) < ratio * distance(second)
+
+
+def mutual(similarity_NM: NDArray[np.float32], best_N: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether each row is also the best of its best column, (N,)."""
+    if not similarity_NM.size:
+        return np.zeros(len(best_N), bool)
+    return similarity_NM.argmax(axis=0)[best_N] == np.arange(len(best_N))

@@ -1,0 +1,173 @@
+"""Where a picture was taken, from a sparse map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.images import Image, as_rgb
+from mambaloc.runtime.maps.absolute_pose import CameraPose, ransac_pose, refine_pose
+from mambaloc.runtime.maps.features import (
+    Features,
+    check_intrinsics,
+    dequantized,
+    detect_features,
+    distance,
+    mutual,
+    rescaled_intrinsics,
+    unambiguous,
+)
+from mambaloc.runtime.maps.sparse_map import SparseMap
+from mambaloc.runtime.maps.viewpoints import spread_m, viewpoints
+from mambaloc.runtime.rotations import quaternion_from_matrix
+
+Floats = NDArray[np.floating[Any]]
+
+_AT_ONCE = 2500  # points, of those that most frames see, which are matched without a pose
+_RATIO = 0.85
+_GUIDED_RATIO = 0.95
+_GUIDED_FARTHEST = 0.9  # of unit descriptors
+_NEAREST = 8  # key frames whose points are searched again
+_WINDOWS = (6.0, 2.0)  # radii of the guided rounds, in times of what is near
+_LEAST_SHARE = 0.1
+_MOST_DEVIATION = 0.03  # of the key frames' spread; wrong poses rest on few matches, or on matches in one corner
+
+
+@dataclass(frozen=True)
+class MapLocalisation:
+    """Where one picture was taken, ``world_from_cam``, and how sure that is.
+
+    Shape:
+        ``position_m`` (3,) camera centre in metres; ``quaternion`` (4,) unit, wxyz, ``w >= 0``; ``covariance`` (6, 6).
+        All NaN where no pose was found.
+
+    Args:
+        position_m: in the map's frame.
+        quaternion: likewise.
+        inliers: matches that agree with the pose.
+        is_accepted: whether to believe it: there are enough, and they fix the position to 3 % of the spread of the
+            map's key frames, one standard deviation in the worst direction.
+        covariance: of the position in metres, then of the rotation in radians about the fixed axes of the world: the
+            order and frame of ROS's PoseWithCovariance. It says how well the matches fix the pose; errors that the
+            map's own poses share are not in it.
+    """
+
+    position_m: Floats
+    quaternion: Floats
+    inliers: int
+    is_accepted: bool
+    covariance: Floats
+
+
+class MapLocaliser:
+    """Localise pictures in a map, without torch and without a network.
+
+    The points that most frames see are matched at once, RANSAC finds a pose, and every point is searched again around
+    where that pose projects it to.
+
+    Args:
+        sparse_map: the map.
+        seed: of RANSAC.
+    """
+
+    def __init__(self, sparse_map: SparseMap, seed: int = 0) -> None:
+        self.map = sparse_map
+        self.seed = seed
+        self._points_m = sparse_map.points_m.astype(np.float64)
+        self._descriptors = dequantized(sparse_map.descriptors)
+        self._views = np.unpackbits(sparse_map.views, axis=1, count=len(sparse_map.key_poses)).view(bool)
+        self._unit_m = spread_m(sparse_map.key_poses)
+        self._viewpoints = viewpoints(sparse_map.key_poses, self._unit_m)
+
+    def localise(self, image: Image, intrinsics: ArrayLike | None = None) -> MapLocalisation:
+        """Localise one picture.
+
+        Args:
+            image: RGB (H, W, 3) or grey (H, W), ``uint8``, of any size, without distortion.
+            intrinsics: (3, 3) pinhole matrix in pixels of it; the map's camera unless given.
+
+        Raises:
+            InputError: for another kind of array, intrinsics that do not fit the picture, or none for a picture of
+                another shape than the map's.
+        """
+        rgb = as_rgb(image)
+        matrix = self._intrinsics(rgb) if intrinsics is None else np.asarray(intrinsics, np.float64)
+        check_intrinsics(matrix, (rgb.shape[1], rgb.shape[0]))
+        # So that things are as large as in the map's pictures, whatever the lens.
+        return self.localise_features(detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0]))
+
+    def localise_features(self, features: Features) -> MapLocalisation:
+        """Localise a picture whose keypoints are found already."""
+        near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
+        best, is_clear = unambiguous(features.descriptors @ self._descriptors[:_AT_ONCE].T, _RATIO)
+        rng = np.random.default_rng(self.seed)
+        pose = ransac_pose(self._points_m[best[is_clear]], features.rays[is_clear], near, rng)
+        if pose is None:
+            return _nowhere()
+        scale = near / 2  # of the refinement; finer where the matches are
+        for window in _WINDOWS:
+            keypoints, points = self._search(features, pose, window * near)
+            if len(points) < 4:
+                return _nowhere()
+            seen_m, rays = self._points_m[points], features.rays[keypoints]
+            pose, covariance = refine_pose(pose, seen_m, rays, scale)
+            off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
+            scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
+        inliers = int((off <= near).sum())
+        deviation_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])  # in the direction that is least sure
+        is_accepted = inliers >= self.map.least_inliers and bool(deviation_m <= _MOST_DEVIATION * self._unit_m)
+        return MapLocalisation(pose.position_m, quaternion_from_matrix(pose.rotation), inliers, is_accepted, covariance)
+
+    def _search(
+        self, features: Features, pose: CameraPose, radius: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Match again what a pose projects near a keypoint: rows of keypoints and of points."""
+        projected, _ = pose.project(self._points_m)
+        corners = features.corner_rays
+        with np.errstate(invalid="ignore"):
+            inside = ((projected >= corners[0]) & (projected <= corners[1])).all(axis=1)
+        visible = np.flatnonzero(inside & self._seen_around(pose))
+        x, y = (features.rays.T[..., None] - projected[visible].T[:, None]).astype(np.float32)
+        nearby = np.where(
+            x * x + y * y <= radius**2, features.descriptors @ self._descriptors[visible].T, np.float32(-1)
+        )
+        best, is_clear = unambiguous(nearby, _GUIDED_RATIO)
+        keep = is_clear & mutual(nearby, best)
+        rows = np.flatnonzero(keep)
+        rows = rows[distance(nearby[rows, best[rows]]) < _GUIDED_FARTHEST]
+        return rows, visible[best[rows]]
+
+    def _seen_around(self, pose: CameraPose) -> NDArray[np.bool_]:
+        """Which points one of the nearest key frames sees, (P,): what is hidden from there is not searched.
+
+        Where the poses of a capture drift, these also agree best with each other.
+        """
+        place = np.concatenate((np.column_stack((pose.rotation, pose.position_m)), [(0, 0, 0, 1)]))
+        apart = ((self._viewpoints - viewpoints(place[None], self._unit_m)) ** 2).sum(axis=1)
+        nearest = np.argsort(apart, kind="stable")[:_NEAREST]
+        return np.asarray(self._views[:, nearest].any(axis=1))
+
+    def _intrinsics(self, image: Image) -> Floats:
+        height, width = image.shape[:2]
+        if abs(width * self.map.size[1] - height * self.map.size[0]) > max(self.map.size):
+            raise InputError(
+                f"picture of {width}x{height}: has another shape than the map's of {self.map.size[0]}x"
+                f"{self.map.size[1]}, so its camera is unknown. Give its intrinsics."
+            )
+        return rescaled_intrinsics(self.map.intrinsics, self.map.size, (width, height))
+
+
+def near_px(width: int) -> float:
+    """How far a match may be from where its point is projected, in pixels of a picture that is so wide.
+
+    Poses of a real capture drift by that much; where matches agree better, the refinement follows them.
+    """
+    return 4.5 * width / 160
+
+
+def _nowhere() -> MapLocalisation:
+    return MapLocalisation(np.full(3, np.nan), np.full(4, np.nan), 0, False, np.full((6, 6), np.nan))

@@ -1,0 +1,148 @@
+"""A sparse map: points of a place and what they look like, in one file."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.files import whole_file, writing
+from mambaloc.runtime.maps.features import check_intrinsics
+
+VERSION = 1
+_MOST_POINTS = 10**7
+_MOST_BYTES = 2**31
+_MOST_PIXELS = 2**15
+_DAMAGE = (
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    NotImplementedError,
+    RecursionError,
+    RuntimeError,
+    MemoryError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@dataclass(frozen=True)
+class SparseMap:
+    """Points triangulated from posed frames, each with the mean descriptor of its views; the most seen come first.
+
+    Shape:
+        ``points_m`` (P, 3) float32, world frame, metres; ``descriptors`` (P, 128) uint8, RootSIFT, see
+        :data:`~mambaloc.runtime.maps.features.DESCRIPTOR_SCALE`; ``views`` (P, ceil(K / 8)) uint8, bits as
+        ``numpy.packbits`` writes them; ``key_poses`` (K, 4, 4) and ``intrinsics`` (3, 3) float64.
+
+    Args:
+        points_m: what a camera sees.
+        descriptors: how they look.
+        views: which key frames see each.
+        key_poses: ``world_from_cam`` of the key frames.
+        size: (width, height) of the pictures in which keypoints were searched.
+        intrinsics: of their camera, of the first key frame where there are several.
+        least_inliers: matches that a pose needs to be accepted.
+        scene: name of the place.
+        digests: of what the map was made from, by name.
+    """
+
+    points_m: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    views: NDArray[np.uint8]
+    key_poses: NDArray[np.float64]
+    size: tuple[int, int]
+    intrinsics: NDArray[np.float64]
+    least_inliers: int
+    scene: str
+    digests: dict[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+    def save(self, path: Path) -> None:
+        """Write it to an ``.npz`` file, whole or not at all.
+
+        Raises:
+            InputError: where it cannot be written.
+        """
+        about = {"version": VERSION, "scene": self.scene, "least_inliers": self.least_inliers, "digests": self.digests}
+        with writing(path, "choose another file with --out"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with whole_file(path) as partial, partial.open("wb") as file:
+                np.savez_compressed(
+                    file,
+                    about=np.frombuffer(json.dumps(about).encode(), np.uint8),
+                    points_m=self.points_m,
+                    descriptors=self.descriptors,
+                    views=self.views,
+                    key_poses=self.key_poses,
+                    size=np.array(self.size, np.int64),
+                    intrinsics=self.intrinsics,
+                )
+
+    @classmethod
+    def load(cls, path: Path) -> SparseMap:
+        """Read a file that :meth:`save` wrote; nothing in it is ever unpickled.
+
+        Raises:
+            InputError: where it is missing, damaged, not a map, or of a newer version.
+        """
+        try:
+            with zipfile.ZipFile(path) as file:
+                if sum(entry.file_size for entry in file.infolist()) > _MOST_BYTES:
+                    raise ValueError(f"it unpacks to more than {_MOST_BYTES} bytes")
+            with np.load(path, allow_pickle=False) as arrays:
+                about = json.loads(arrays["about"].tobytes())
+                if about["version"] <= VERSION:
+                    return cls._checked(about, {name: arrays[name] for name in _ARRAYS})
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error}). tools/map.py writes maps.") from None
+        except (*_DAMAGE, InputError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise InputError(f"{path}: is damaged or not a map ({reason}). Build the map again.") from None
+        raise InputError(
+            f"{path}: is of version {about['version']}, and this program reads up to {VERSION}. Update the program."
+        )
+
+    @classmethod
+    def _checked(cls, about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> SparseMap:
+        for name, (dtype, shape) in _ARRAYS.items():
+            given = arrays[name]
+            fits = len(given.shape) == len(shape) and all(b in (0, a) for a, b in zip(given.shape, shape, strict=True))
+            if given.dtype != dtype or not fits:
+                raise ValueError(f"{name} is {given.dtype} {given.shape}")
+        points, key_poses, (width, height) = arrays["points_m"], arrays["key_poses"], map(int, arrays["size"])
+        counts = {len(points), len(arrays["descriptors"]), len(arrays["views"])}
+        if len(counts) != 1 or not 0 < len(points) <= _MOST_POINTS:
+            raise ValueError(f"{counts} points, descriptors and views")
+        if not len(key_poses) or arrays["views"].shape[1] != -(-len(key_poses) // 8):
+            raise ValueError(f"{len(key_poses)} key frames in views of {arrays['views'].shape[1]} bytes")
+        if not all(np.isfinite(arrays[name]).all() for name in ("points_m", "key_poses")):
+            raise ValueError("numbers are not finite")
+        if not 0 < width <= _MOST_PIXELS or not 0 < height <= _MOST_PIXELS:
+            raise ValueError(f"pictures of {width}x{height}")
+        check_intrinsics(arrays["intrinsics"], (width, height))
+        return cls(
+            points, arrays["descriptors"], arrays["views"], key_poses, (width, height), arrays["intrinsics"],
+            int(about["least_inliers"]), str(about["scene"]),
+            {str(name): str(digest) for name, digest in dict(about["digests"]).items()},
+        )  # fmt: skip
+
+
+_ARRAYS = {  # a side of 0 may have any length
+    "points_m": (np.float32, (0, 3)),
+    "descriptors": (np.uint8, (0, 128)),
+    "views": (np.uint8, (0, 0)),
+    "key_poses": (np.float64, (0, 4, 4)),
+    "size": (np.int64, (2,)),
+    "intrinsics": (np.float64, (3, 3)),
+}

@@ -1,0 +1,134 @@
+"""tools/map.py: recipes, what it writes, and real frames."""
+
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from mambaloc.errors import InputError
+from mambaloc.mapping import evaluating
+from mambaloc.mapping.building import MapSettings
+from mambaloc.mapping.evaluating import MapErrors, build_and_measure
+from mambaloc.mapping.recipe import MapRecipe, read_recipe
+from mambaloc.rendering import embedded_room, embedded_walk, shots_of_sequences, write_7scenes
+from mambaloc.runtime.maps import SparseMap
+
+ROOT = Path(__file__).parents[2]
+BLOCKS = ROOT / "recipes" / "map_redkitchen_blocks.yaml"
+
+
+def main(argv):
+    runpy.run_path(str(ROOT / "tools" / "map.py"))["main"](argv)
+
+
+@pytest.fixture(scope="session")
+def den(made_once):
+    """A root with one scene, the embedded room in the 7-Scenes layout: 32 training and 6 test frames of 160x120."""
+
+    def render(root: Path) -> None:
+        walks = {number: embedded_walk(count, number, 0.0, 360 / count) for number, count in ((1, 32), (2, 6))}
+        write_7scenes(root, "den", shots_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
+
+    return made_once("den", render)
+
+
+def test_a_recipe_is_built_measured_and_written(den, tmp_path, capsys):
+    recipe = tmp_path / "den.yaml"
+    recipe.write_text(yaml.safe_dump({"scene": "den", "root": str(den), "width": 160, "ransac_seeds": [0, 1]}))
+    main([str(recipe), "--frames", "30", "--out", str(tmp_path / "out")])
+    last = capsys.readouterr().out.splitlines()[-1]
+    sparse_map = SparseMap.load(tmp_path / "out" / "map.npz")
+    result = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    metrics = result["metrics"]
+    assert last.startswith(f"den: median {metrics['position_error_m']:.3f} m / {metrics['rotation_error_deg']:.2f} deg")
+    for word in ("mean", "worst", "within 10 cm 5 deg", "MiB", "core-seconds", "ms a query"):
+        assert word in last
+    assert metrics["position_error_m"] < 0.03
+    assert (sparse_map.scene, sparse_map.size, len(sparse_map.key_poses)) == ("den", (160, 120), 30)
+    assert (result["count"], result["ransac_seeds"], result["split"]) == (6, [0, 1], "test")
+    assert (result["data"]["train_frames"], result["map"]["settings"]["key_frames"]) == (32, 30)
+    assert result["map"]["points"] == len(sparse_map)
+    assert result["evaluation"]["commit"]
+
+
+def test_the_recipe_of_the_blocks_is_read():
+    recipe = read_recipe(BLOCKS)
+    assert recipe.label == "redkitchen seq-01 blocks (800/200)"
+    assert isinstance(recipe, MapRecipe)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "does not name a scene"),
+        ("[1]", "does not name a scene"),
+        ("scene: 3", "does not name a scene"),
+        ("scene: a\nframes: 3", "'frames' is unknown"),
+        ("scene: a\nwidth: wide", "width is 'wide'. Give a whole number of 32 or more"),
+        ("scene: a\nkey_frames: true", "key_frames is 'True'"),
+        ("scene: a\nkey_frames: 1", "key_frames is '1'. Give a whole number of 2 or more"),
+        ("scene: a\nroot: 3", "root is '3'. Give a text"),
+        ("scene: a\nransac_seeds: []", "ransac_seeds is '[]'. Give a list"),
+        ("scene: a\nransac_seeds: 0", "ransac_seeds is '0'. Give a list"),
+        ("scene: [", "is no YAML"),
+    ],
+)
+def test_a_wrong_recipe_is_refused_in_a_line(tmp_path, text, message, capsys):
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(SystemExit) as exit_:
+        main([str(path)])
+    assert exit_.value.code == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+
+
+def test_a_missing_recipe_and_too_few_frames_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"cannot be read"):
+        read_recipe(tmp_path / "none.yaml")
+    with pytest.raises(SystemExit):
+        main([str(BLOCKS), "--frames", "1"])
+
+
+def test_frames_without_a_pose_count_in_medians_and_shares_but_not_in_means():
+    lost = MapErrors(*np.array([[0.01, 0.03, np.inf], [1.0, 2.0, np.inf]]), np.array([1, 1, 0], bool), np.ones(3))
+    summary = lost.summary()
+    assert summary["position_error_m"] == 0.03
+    assert summary["position_error_mean_m"] == pytest.approx(0.02)
+    assert summary["position_error_worst_m"] == np.inf
+    assert summary["without_pose"] == summary["above_20cm"] == pytest.approx(1 / 3)
+    assert summary["recall_10cm_5deg"] == pytest.approx(2 / 3)
+    assert summary["accepted_and_wrong"] == 0
+    nowhere = MapErrors(np.full(3, np.inf), np.full(3, np.inf), np.zeros(3, bool), np.ones(3)).summary()
+    assert nowhere["position_error_mean_m"] == nowhere["position_error_m"] == np.inf
+
+
+def test_a_result_without_poses_is_written_as_json(den, tmp_path, monkeypatch):
+    nowhere = MapErrors(np.full(8, np.inf), np.full(8, np.inf), np.zeros(8, bool), np.ones(8))
+    monkeypatch.setattr(evaluating, "measure", lambda *_: nowhere)
+    recipe = MapRecipe("den", root=str(den), settings=MapSettings(30, 160), ransac_seeds=(0,))
+    assert "worst inf m" in evaluating.describe(build_and_measure(recipe, tmp_path))
+    metrics = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)["metrics"]
+    assert metrics["position_error_worst_m"] is None
+    assert metrics["without_pose"] == 1
+
+
+@pytest.fixture
+def blocks():
+    folder = ROOT.parent / "shared" / "data" / "7scenes_blocks"
+    if not folder.is_dir():
+        pytest.skip(f"no real data at {folder}")
+    return str(folder)
+
+
+def test_real_frames_are_localised_to_centimetres(blocks, tmp_path):
+    """Redkitchen seq-01 blocks (800/200), 40 key frames at 160x120; measured: 0.041 m / 0.93 deg."""
+    recipe = MapRecipe("redkitchen", root=blocks, settings=MapSettings(40, 160, 2**18), ransac_seeds=(0,))
+    metrics = build_and_measure(recipe, tmp_path)["metrics"]
+    assert metrics["position_error_m"] < 0.05
+    assert metrics["rotation_error_deg"] < 2
+    assert (tmp_path / "map.npz").stat().st_size <= 2**18
