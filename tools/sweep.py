@@ -5,7 +5,6 @@ from pathlib import Path
 
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.sweep import Store, print_plan, read_sweep, run_sweep
-from mambaloc.sweep.report import write_report
 
 
 @exits_cleanly
@@ -42,6 +41,8 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
+    from mambaloc.sweep.report import write_report  # needs torch, which running does not
+
     out = args.out or args.results / "report"
     rows, failed = write_report(args.results, out, args.compare, args.epoch, args.reach)
     print(f"{out}: report.html, report.md, tables/, plots/; {len(rows)} rows, {len(failed)} trials failed")

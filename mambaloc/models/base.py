@@ -267,17 +267,23 @@ class LitPoseRegressor(L.LightningModule):
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]
-        cls, checkpoint_path: str | Path, map_location: str | torch.device | None = None, **kwargs: Any
+        cls,
+        checkpoint_path: str | Path,
+        map_location: str | torch.device | None = None,
+        strict: bool | None = None,
+        **kwargs: Any,
     ) -> Self:
         """Load a trained system; weights only, never by unpickling code.
 
         Args:
             checkpoint_path: what a training run wrote.
             map_location: the device to put it on; the CPU unless given.
+            strict: whether weights that are missing or left over are an error; they are unless given.
             kwargs: hyperparameters that replace the stored ones.
 
         Raises:
             InputError: where the file is missing, is no such checkpoint or holds anything but plain data.
         """
         kwargs.pop("weights_only", None)  # Lightning's option, which might ask for more
-        return build_from(read_checkpoint(checkpoint_path), cls, **kwargs).to(map_location or "cpu")
+        system = build_from(read_checkpoint(checkpoint_path), cls, strict is not False, **kwargs)
+        return system.to(map_location or "cpu")

@@ -58,7 +58,7 @@ def start_from(network: nn.Module, path: str | Path) -> None:
         ) from None
 
 
-def build_from(stored: dict[str, Any], cls: type[_System], **changed: Any) -> _System:
+def build_from(stored: dict[str, Any], cls: type[_System], strict: bool = True, **changed: Any) -> _System:
     """Build a trained system on the CPU.
 
     Backbone weights are in the checkpoint, so whatever started the training is not looked for again.
@@ -66,6 +66,7 @@ def build_from(stored: dict[str, Any], cls: type[_System], **changed: Any) -> _S
     Args:
         stored: what :func:`read_checkpoint` returned.
         cls: the system's class.
+        strict: whether weights that are missing or left over are an error.
         changed: hyperparameters that replace the stored ones.
     """
     # Without Lightning's own notes on the class: which one to build is not the file's to say.
@@ -76,7 +77,7 @@ def build_from(stored: dict[str, Any], cls: type[_System], **changed: Any) -> _S
         arguments = {name: value for name, value in arguments.items() if name in taken}
     system = cls(**arguments)
     system.on_load_checkpoint(stored)
-    system.load_state_dict(stored["state_dict"])
+    system.load_state_dict(stored["state_dict"], strict=strict)
     return system
 
 

@@ -27,12 +27,8 @@ CREATE TABLE IF NOT EXISTS trials (
     ended TEXT NOT NULL
 )
 """
-_RENAME = """
-BEGIN IMMEDIATE;
-ALTER TABLE cells RENAME TO trials;
-ALTER TABLE trials RENAME COLUMN words TO args;
-COMMIT;
-"""  # of a store written when trials were called cells, and their arguments words
+_RENAMES = ("ALTER TABLE cells RENAME TO trials", "ALTER TABLE trials RENAME COLUMN words TO args")
+"""For a store written when trials were called cells, and their arguments words."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +69,11 @@ class Store:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._database = sqlite3.connect(self.path)
-            if self._database.execute("SELECT 1 FROM sqlite_master WHERE name = 'cells'").fetchone():
-                self._database.executescript(_RENAME)
+            if self._is_old():
+                with self._database:
+                    self._database.execute("BEGIN IMMEDIATE")
+                    for rename in _RENAMES if self._is_old() else ():  # another process may have done it meanwhile
+                        self._database.execute(rename)
             with self._database:
                 self._database.execute(_TABLE)
         except OSError as error:
@@ -83,6 +82,9 @@ class Store:
             raise InputError(f"{self.path}: cannot be written ({error}); choose another --out") from None
         except sqlite3.Error as error:
             raise InputError(f"{self.path}: is no store of results ({error}); choose another --out") from None
+
+    def _is_old(self) -> bool:
+        return bool(self._database.execute("SELECT 1 FROM sqlite_master WHERE name = 'cells'").fetchone())
 
     @classmethod
     def ended(cls, folder: Path) -> dict[str, StoredTrial]:

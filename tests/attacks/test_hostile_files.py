@@ -228,7 +228,7 @@ LABEL = "seq1/frame00001.png 1 2 3 1 0 0 0"
         ("overlay.yaml", lambda folder, *_: Setting("mambaloc").with_overlay(folder / "overlay.yaml"), LAUGHS),
         ("recipe.yaml", lambda folder, *_: recipe_arguments([str(folder / "recipe.yaml")]), LAUGHS),
         ("recipe.yaml", lambda folder, *_: recipe_arguments([str(folder / "recipe.yaml")]), "model: &a [*a]"),
-        ("matrix.yaml", lambda folder, *_: read_sweep(folder / "matrix.yaml"), "a: {" * 10**5),
+        ("sweep.yaml", lambda folder, *_: read_sweep(folder / "sweep.yaml"), "a: {" * 10**5),
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 20 else None,
 )
@@ -260,9 +260,9 @@ def test_overlays(tmp_path, fed):
     fed("overlay", lambda path: Setting("mambaloc").with_overlay(path), Path(overlay))
 
 
-def test_matrices(tmp_path, fed):
-    matrix = shutil.copy(REPOSITORY / "recipes/sweeps/redkitchen_blocks.yaml", tmp_path)
-    fed("matrix", read_sweep, Path(matrix))
+def test_sweeps(tmp_path, fed):
+    sweep = shutil.copy(REPOSITORY / "recipes/sweeps/redkitchen_blocks.yaml", tmp_path)
+    fed("sweep", read_sweep, Path(sweep))
 
 
 def test_manifests(tmp_path, fed):
@@ -304,5 +304,5 @@ def test_bundles(inputs, tmp_path, fed):
 @pytest.mark.slow
 def test_models(inputs, tmp_path, fed):
     model = Path(shutil.copy(inputs / "model.onnx", tmp_path))
-    few = settings.get_profile("ci").max_examples  # ONNX Runtime's parser is C++ in this process: no long campaign
-    fed("ONNX model", lambda path: Localiser(path, 1), model, most=few)
+    # ONNX Runtime's parser is C++ in this process: no long campaign.
+    fed("ONNX model", lambda path: Localiser(path, 1), model, most=40)

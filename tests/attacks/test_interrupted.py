@@ -53,7 +53,7 @@ def test_a_write_that_cannot_end(name, how, inputs, undisturbed, tmp_path, tries
         code, stderr, _ = outcome_of(subject, inputs, out, partial(limit, size, signals[how]))
         if code is None:
             assert how == "killed"
-        else:  # a matrix also where one of its trainings was killed
+        else:  # a sweep also where one of its trainings was killed
             assert code == 2
             assert_one_line(stderr)
         tally(f"{name}: {how} within a write", "one line, exit code 2" if code else "killed")

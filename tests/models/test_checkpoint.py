@@ -36,6 +36,15 @@ def test_the_system_is_the_one_that_was_trained(best):
     assert torch.equal(positions[0], positions[2])
 
 
+def test_weights_left_over_are_an_error_unless_asked_otherwise(best, tmp_path):
+    stored = torch.load(best.path, weights_only=True)
+    stored["state_dict"]["network.extra"] = torch.zeros(1)
+    torch.save(stored, tmp_path / "more.ckpt")
+    with pytest.raises(RuntimeError, match=r"Unexpected key.*network\.extra"):
+        LitMambaLoc.load_from_checkpoint(tmp_path / "more.ckpt")
+    assert LitMambaLoc.load_from_checkpoint(tmp_path / "more.ckpt", strict=False).provenance["model"] == "mambaloc"
+
+
 def test_hyperparameters_given_to_load_from_checkpoint_replace_the_stored(best):
     assert LitMambaLoc.load_from_checkpoint(str(best.path), map_location="cpu", lr=0.5).lr == 0.5
     assert best.system().lr == 0.001

@@ -137,6 +137,7 @@ def test_evaluate_tool_prints_and_writes(trained, tmp_path):
         (["missing.ckpt"], "missing.ckpt"),
         (["CHECKPOINT", "--data.image_size", "16"], "trained on (32, 32)"),
         (["CHECKPOINT", "--data.root", "nowhere"], "nowhere"),
+        (["CHECKPOINT", "--accelerator", "abacus"], "--accelerator abacus: You selected an invalid accelerator"),
         (["pyproject.toml"], "pyproject.toml"),
     ],
 )
