@@ -12,8 +12,8 @@ _CHANCES = 2**16
 class Dropout(nn.Dropout):
     """``nn.Dropout``; on a CPU one random number of 64 bits decides on four elements.
 
-    PyTorch draws a number an element there, one after another: a training step of MambaLoc takes 1.06 times as long. The
-    probability is rounded to a multiple of 2^-16, and the scale with it, so that the mean stays as it is.
+    PyTorch draws a number an element there, one after another: a training step of MambaLoc takes 1.06 times as long.
+    The probability is rounded to a multiple of 2^-16, and the scale with it, so that the mean stays as it is.
 
     Shape:
         (*) -> (*).

@@ -48,7 +48,10 @@ def assert_one_training(run, recipe, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_of_lightnings(recipe, tmp_path):
-    """They keep the best epoch, too, and the first of them exports it with its uncertainty while the other waits."""
+    """They keep the best epoch, too, and the first of them exports it with its uncertainty while the other waits.
+
+    Half a minute: two processes import torch, train and export, as two machines would; nothing else guards that.
+    """
     run = tmp_path / "runs/run"
     words = [*TRAIN, recipe, "--trainer.devices", "2", "--trainer.default_root_dir", run]
     words += ["--best_checkpoint.save_top_k", "1", "--onnx_export.enabled", "true"]
