@@ -133,6 +133,8 @@ def _each(pool: ThreadPoolExecutor, work: Callable[[S], T], items: Sequence[S], 
 def _features(frames: PosedFrames, row: int, width: int) -> Features:
     image = frames.images[row]
     rgb = read_image(image) if isinstance(image, Path) else as_rgb(image)
+    if width > rgb.shape[1]:
+        raise InputError(f"width {width}: the pictures are {rgb.shape[1]} pixels wide. Give at most that.")
     return detect_features(rgb, frames.intrinsics[row], width / rgb.shape[1])
 
 

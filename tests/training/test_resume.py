@@ -26,6 +26,11 @@ def epochs_of(run):
     return epochs
 
 
+def is_logged(run):
+    """Whether the training of an epoch is in the log."""
+    return any("train/loss" in log.read_text() for log in (run / "metrics").glob("version_*/metrics.csv"))
+
+
 COMPARED = ("train/loss", "train/lr", "train/s_position", "val/loss", "val/position_error_m", "val/rotation_error_deg")
 
 
@@ -66,7 +71,8 @@ def test_stopped_run_leaves_a_checkpoint_that_resumes_exactly(how, tiny_recipe, 
     process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, preexec_fn=heed)
     last = stopped / "checkpoints/last.ckpt"
     deadline = time.monotonic() + 120
-    while not last.exists() and time.monotonic() < deadline and process.poll() is None:
+    # An epoch's log is written after its checkpoint; what is compared below is in both.
+    while not (last.exists() and is_logged(stopped)) and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(how)
     _, stderr = process.communicate(timeout=60)
