@@ -204,3 +204,8 @@ def test_frames_may_be_files(walk, tmp_path):
 def test_maps_are_built_and_used_without_torch():
     code = "import sys; import mambaloc.mapping, mambaloc.runtime.maps; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_pictures_are_not_enlarged(walk):
+    with pytest.raises(InputError, match=r"width 320: the pictures are 160 pixels wide\. Give at most that\."):
+        build_map(walk.frames, MapSettings(key_frames=40, width=320), "room")
