@@ -120,9 +120,9 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
     sparse_map = build_map(train, recipe.settings, name)
     core_seconds = time.process_time() - cpu
     sparse_map.save(out / "map.npz")
-    errors = measure(sparse_map, test, recipe.ransac_seeds)
+    metrics = measure(sparse_map, test, recipe.ransac_seeds).summary()
     result = {
-        "metrics": errors.summary(),
+        "metrics": metrics,
         "label": name,
         "split": "test",
         "count": len(test),
@@ -151,7 +151,7 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
         },
     }
     # JSON has no infinity, which the worst error is where a frame has no pose.
-    finite = {name: value if math.isfinite(value) else None for name, value in errors.summary().items()}
+    finite = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
     with writing(out), whole_file(out / "metrics.json") as partial:
         partial.write_text(json.dumps({**result, "metrics": finite}, indent=2) + "\n", encoding="utf-8")
     return result

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
+from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.runtime.maps.features import check_intrinsics
 
 VERSION = 1
 _MOST_POINTS = 10**7
 _MOST_BYTES = 2**31
-_MOST_PIXELS = 2**15
 _DAMAGE = (
     ValueError,
     KeyError,
@@ -128,7 +128,7 @@ class SparseMap:
             raise ValueError(f"{len(key_poses)} key frames in views of {arrays['views'].shape[1]} bytes")
         if not all(np.isfinite(arrays[name]).all() for name in ("points_m", "key_poses")):
             raise ValueError("numbers are not finite")
-        if not 0 < width <= _MOST_PIXELS or not 0 < height <= _MOST_PIXELS:
+        if not 0 < width <= LARGEST_SIDE_PX or not 0 < height <= LARGEST_SIDE_PX:
             raise ValueError(f"pictures of {width}x{height}")
         check_intrinsics(arrays["intrinsics"], (width, height))
         return cls(
