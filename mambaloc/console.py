@@ -13,8 +13,6 @@ from typing import Any
 
 from mambaloc.errors import InputError
 
-_MOST_THREADS = 256
-
 
 def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
     """Make a tool's ``main`` print an :class:`InputError` as one line on stderr and exit with code 2."""
@@ -42,11 +40,20 @@ def _user_mistake(error: BaseException | None) -> InputError | None:
     return error
 
 
-def thread_count(text: str) -> int:
-    """Read an option's number of threads, for :mod:`argparse`."""
-    if not text.isdecimal() or not 1 <= int(text) <= _MOST_THREADS:
-        raise argparse.ArgumentTypeError(f"{text}: give a number of threads from 1 to {_MOST_THREADS}")
-    return int(text)
+def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Make a reader of an option's whole number within bounds, for :mod:`argparse`."""
+
+    def read(text: str) -> int:
+        if not text.isdecimal() or not least <= int(text) <= (int(text) if most is None else most):
+            bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
+            raise argparse.ArgumentTypeError(f"{text}: give a whole number {bounds}")
+        return int(text)
+
+    return read
+
+
+thread_count = whole_number(1, 256)
+"""Reads an option's number of threads."""
 
 
 def quieten() -> None:
