@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 import time
+import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import lightning as L
 import torch
 
 from mambaloc.data.datasets.capture import CAPTURE
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, InputWarning
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.mapping import MapSettings, build_map
 from mambaloc.mapping.evaluating import with_cameras
@@ -61,7 +61,7 @@ class MapBuild(L.Callback):
             posed = with_cameras(data.hparams["dataset"], data.folder, frames)
             sparse_map = build_map(posed, self.settings, data.folder.name, threads=torch.get_num_threads())
         except InputError as error:
-            print(f"no map: {error} The training goes on.", file=sys.stderr)
+            warnings.warn(f"{error} The training goes on without a map.", InputWarning, stacklevel=2)
             path.unlink(missing_ok=True)  # of other frames
             return
         replace(sparse_map, digests={**sparse_map.digests, **digests}).save(path)

@@ -17,7 +17,7 @@ from mambaloc.evaluation.intervals import BLOCK, LEVEL, block_resamples, median_
 from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.evaluation.references import frozen_features, median_training_pose, nearest_training_pose, retrieval
 from mambaloc.evaluation.trained import Trained, load_trained
-from mambaloc.evaluation.trajectories import write_csv
+from mambaloc.evaluation.trajectories import write_predictions
 from mambaloc.evaluation.with_map import Answers, MeasuredMap
 from mambaloc.files import whole_file, writing
 from mambaloc.metrics import PoseErrorTable, summarise

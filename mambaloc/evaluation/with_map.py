@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.progress import track
 
+from mambaloc.console import progress
 from mambaloc.data import Frames, PoseDataModule
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, InputWarning
 from mambaloc.files import sha256
 from mambaloc.images import read_image
 from mambaloc.mapping.evaluating import MapErrors, with_cameras
@@ -117,7 +117,7 @@ def measure_map(path: Path, data: PoseDataModule) -> MeasuredMap:
 
 
 def measure_map_of_run(run: Path, data: PoseDataModule) -> MeasuredMap | None:
-    """Localise every test frame in a run's map; None without one, or, with a line on stderr, where it cannot be used.
+    """Localise every test frame in a run's map; None without one, or, with a warning, where it cannot be used.
 
     Raises:
         InputError: for frames that are missing or bad.
@@ -129,7 +129,7 @@ def measure_map_of_run(run: Path, data: PoseDataModule) -> MeasuredMap | None:
     try:
         return measure_map(path, data)
     except InputError as error:
-        print(f"not measured: {error}", file=sys.stderr)
+        warnings.warn(f"{error} The network is measured without the map.", InputWarning, stacklevel=2)
         return None
 
 
@@ -138,7 +138,7 @@ def _localise(
 ) -> tuple[list[MapLocalisation], Floats]:
     found, cpu_s = [], []
     rows = zip(frames.image_paths, intrinsics, priors, strict=True)
-    for path, matrix, prior in track(rows, "in the map", len(frames), transient=True):
+    for path, matrix, prior in progress(rows, "in the map", len(frames)):
         rgb, start = read_image(path), time.process_time()
         found.append(localiser.localise(rgb, matrix, prior))
         cpu_s.append(time.process_time() - start)

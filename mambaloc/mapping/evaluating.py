@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from mambaloc import provenance
+from mambaloc.console import progress
 from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, Split
@@ -46,7 +46,7 @@ class MapErrors:
     cpu_s: Floats
 
     def summary(self) -> dict[str, float]:
-        """As :func:`~mambaloc.metrics.summarise_errors`, with how often the map answers, believes itself and is wrong."""
+        """As :func:`~mambaloc.metrics.summarise_errors`, and how often a pose is accepted, and wrong all the same."""
         is_wrong = (self.position_m > _WRONG[0]) | (self.rotation_deg > _WRONG[1])
         return {
             **summarise_errors(self.position_m, self.rotation_deg),
@@ -82,11 +82,8 @@ def measure(sparse_map: SparseMap, frames: PosedFrames, seeds: Sequence[int]) ->
     """Localise frames in a map, once a seed; time is this process's own on all cores, without decoding the picture."""
     localisers = [MapLocaliser(sparse_map, seed) for seed in seeds]
     rows = []
-    for image, intrinsics, truth in track(
-        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True),
-        "queries  ",
-        len(frames),
-        transient=True,
+    for image, intrinsics, truth in progress(
+        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True), "queries", len(frames)
     ):
         rgb = read_image(image) if isinstance(image, Path) else image
         for localiser in localisers:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
@@ -135,19 +135,17 @@ def summarise(table: PoseErrorTable) -> dict[str, float]:
     return summarise_errors(table.position_error_m.cpu().numpy(), table.rotation_error_deg.cpu().numpy())
 
 
-def summarise_errors(
-    position_m: NDArray[np.floating[Any]], rotation_deg: NDArray[np.floating[Any]]
-) -> dict[str, float]:
+def summarise_errors(position_m: ArrayLike, rotation_deg: ArrayLike) -> dict[str, float]:
     """Reduce errors to medians, means, the worst position and recalls; the plain names are the medians.
 
     The median of an even number of frames is the mean of the middle two. An infinite error, of a frame without a pose,
-    counts in medians and recalls, and is left out of means, which are infinite where nothing else is left. NaN stays NaN.
+    counts in medians and recalls, and is left out of means, which are infinite where no other is left. NaN stays NaN.
 
     Args:
         position_m: one a frame, (N,).
         rotation_deg: of the same frames.
     """
-    position_m, rotation_deg = position_m.astype(np.float64), rotation_deg.astype(np.float64)
+    position_m, rotation_deg = np.asarray(position_m, np.float64), np.asarray(rotation_deg, np.float64)
     has_pose = ~np.isinf(position_m)
     summary = {
         "position_error_m": float(np.median(position_m)),
