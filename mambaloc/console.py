@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 from mambaloc.errors import InputError, InputWarning
 
-_MOST_THREADS = 256
 _as_usual = warnings.formatwarning
 
 T = TypeVar("T")
@@ -43,9 +42,9 @@ def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _in_a_line(message: Warning | str, category: type[Warning], *where: Any, **line: Any) -> str:
-    return (
-        f"warning: {message}\n" if issubclass(category, InputWarning) else _as_usual(message, category, *where, **line)
-    )
+    if issubclass(category, InputWarning):
+        return f"warning: {message}\n"
+    return _as_usual(message, category, *where, **line)
 
 
 def _user_mistake(error: BaseException | None) -> InputError | None:
@@ -55,11 +54,20 @@ def _user_mistake(error: BaseException | None) -> InputError | None:
     return error
 
 
-def thread_count(text: str) -> int:
-    """Read an option's number of threads, for :mod:`argparse`."""
-    if not text.isdecimal() or not 1 <= int(text) <= _MOST_THREADS:
-        raise argparse.ArgumentTypeError(f"{text}: give a number of threads from 1 to {_MOST_THREADS}")
-    return int(text)
+def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Make a reader of an option's whole number within bounds, for :mod:`argparse`."""
+
+    def read(text: str) -> int:
+        if not text.isdecimal() or not least <= int(text) <= (int(text) if most is None else most):
+            bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
+            raise argparse.ArgumentTypeError(f"{text}: give a whole number {bounds}")
+        return int(text)
+
+    return read
+
+
+thread_count = whole_number(1, 256)
+"""Reads an option's number of threads."""
 
 
 def pinhole_matrix(text: str) -> list[list[float]]:
