@@ -67,7 +67,8 @@ class MapBuild(L.Callback):
         replace(sparse_map, digests={**sparse_map.digests, **digests}).save(path)
         print(
             f"{path}: {len(sparse_map)} points from {len(sparse_map.key_poses)} key frames, "
-            f"{path.stat().st_size / 2**20:.2f} MiB, built in {time.perf_counter() - started:.1f} s",
+            f"{path.stat().st_size / 2**20:.2f} MiB, built in {time.perf_counter() - started:.1f} s; "
+            "tools/localize.py localises with it already",
             flush=True,
         )
 

@@ -120,6 +120,20 @@ def test_a_resumed_run_keeps_its_map_unless_frames_or_settings_changed(den, tmp_
     assert len(SparseMap.load(tmp_path / "map/map.safetensors").key_poses) == 16
 
 
+@pytest.mark.slow
+def test_a_resumed_command_leaves_the_file_alone(trained_with_map, tmp_path, capsys):
+    run = shutil.copytree(trained_with_map, tmp_path / "run")
+    before = (run / "map/map.safetensors").stat()
+    recipe, last = trained_with_map.parent / "recipe.yaml", run / "checkpoints/last.ckpt"
+    settings = ["--map.enabled", "true", "--map.width", "160", "--map.key_frames", "30"]
+    main([str(recipe), *settings, "--ckpt_path", str(last), "--trainer.max_epochs", "2"])
+    after = (run / "map/map.safetensors").stat()
+    assert (before.st_ino, before.st_mtime_ns) == (after.st_ino, after.st_mtime_ns)
+    said = capsys.readouterr().out
+    assert f"{run}/map/map.safetensors: is built from these frames already" in said
+    assert "last and map" in said
+
+
 # --- where there can be none -----------------------------------------------------------------------------------------
 
 
