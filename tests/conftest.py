@@ -149,6 +149,20 @@ def trained_student(made_once, scenes):
 
 
 @pytest.fixture(scope="session")
+def trained_with_map(made_once, den):
+    """The folder of a tiny MambaLoc's run of one epoch in ``den``, without validation, and of its map."""
+    from mambaloc.cli import main
+
+    def train(folder: Path) -> None:
+        model = {"class_path": "LitMambaLoc", "init_args": TINY_MAMBALOC}
+        recipe = write_recipe(folder / "recipe.yaml", den, model, {"scene": "den", "validation": "none"}, max_epochs=1)
+        options = ["--map.enabled", "true", "--map.width", "160", "--map.key_frames", "30"]
+        main([str(recipe), *options, "--trainer.default_root_dir", str(folder / "run")])
+
+    return made_once("trained_with_map", train) / "run"
+
+
+@pytest.fixture(scope="session")
 def bundle_of_tensors(made_once, trained_student):
     """A bundle of the tiny student: float32, float16 and ORT models that take normalised tensors."""
     return _bundle(made_once, "bundle_of_tensors", trained_student, raw_input=False)
