@@ -1,6 +1,7 @@
 """Bundles: every model in them finds what PyTorch finds, and what was changed is found out."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from importlib import resources
@@ -22,7 +23,9 @@ from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Localiser, Preprocessing
 from mambaloc.runtime.bundle import verify_bundle
-from mambaloc.runtime.maps import SparseMap
+from mambaloc.runtime.maps import SparseMap, absolute_pose, drift, features, lens, sparse_map, viewpoints
+from mambaloc.runtime.maps import localiser as maps_localiser
+from mambaloc.runtime.maps.localiser import near_px
 
 pytestmark = pytest.mark.usefixtures("converted_once")
 
@@ -122,6 +125,7 @@ def test_a_map_is_described_with_poses_that_a_port_must_find(mapped, map_of_den,
         assert frame["map"]["inliers"] >= sparse_map.least_inliers
         np.testing.assert_allclose(frame["map"]["position_m"], true_m, atol=0.03)
     assert "`map.safetensors`: sparse map" in (mapped / "README.md").read_text()
+    assert "namespace mambaloc" in (mapped / "map_localiser.hpp").read_text()
 
 
 @pytest.mark.slow
@@ -191,6 +195,31 @@ def test_every_kind_of_app_has_a_page(target):
     page = (resources.files("mambaloc.export") / "integration" / f"{target}.md").read_text()
     assert "contract.json" in page
     assert "frames" in page
+    assert "map.safetensors" in page
+
+
+def test_native_apps_decide_as_python_does():
+    """The C++ of the bundles was run beside Python once; this holds its numbers to Python's from then on."""
+    header = (resources.files("mambaloc.export") / "integration" / "map_localiser.hpp").read_text()
+    written = {float(number) for number in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?", header)}
+    numbers = {
+        *(
+            maps_localiser._AT_ONCE,
+            maps_localiser._RATIO,
+            maps_localiser._GUIDED_RATIO,
+            maps_localiser._GUIDED_FARTHEST,
+        ),
+        *(
+            maps_localiser._NEAREST,
+            *maps_localiser._WINDOWS,
+            maps_localiser._LEAST_SHARE,
+            maps_localiser._MOST_DEVIATION,
+        ),
+        *(near_px(160), drift._LENGTH, drift._NUGGET, viewpoints._TURN_DEG, lens._STEPS),
+        *(absolute_pose._TRIALS, absolute_pose._CONFIDENCE, absolute_pose._STEPS),
+        *(features._MOST_KEYPOINTS, features._CONTRAST, sparse_map.VERSION),
+    }
+    assert numbers - written == set()
 
 
 # --- preprocessing inside ---------------------------------------------------------------------------------------------

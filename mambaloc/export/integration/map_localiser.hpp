@@ -1,14 +1,15 @@
-// Localise pictures in a bundle's map.safetensors. C++17; OpenCV 4.8 or newer: core, imgproc, features2d, calib3d.
+// Localise pictures in a bundle's map.safetensors. C++17; OpenCV 4.8 or a later 4: core, imgproc, features2d, calib3d.
 //
-//   mambaloc::MapLocaliser localiser(bytes);                    // of map.safetensors; throws std::runtime_error
-//   auto found = localiser.localise(rgb, intrinsics, &prior);   // prior: the network's pose, or nullptr
+//   mambaloc::MapLocaliser localiser(bytes);                   // of the file; throws std::exception
+//   auto found = localiser.localise(rgb, intrinsics, &prior);  // prior: the network's pose, or nullptr
 //   if (found.accepted) use(found); else use(network);
 //
 // Poses are world_from_cam: metres; OpenCV camera axes (x right, y down, z forward). One object serves any thread.
-// It follows mambaloc/runtime/maps, whose docstrings explain each step; the bundle's frames check it.
+// Each step is that of mambaloc/runtime/maps in Python; INTEGRATION.md says how to check it with the bundle's frames.
 #pragma once
 
 #include <algorithm>
+#include <bitset>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -22,6 +23,10 @@
 #include <opencv2/core.hpp>
 #include <opencv2/features2d.hpp>
 #include <opencv2/imgproc.hpp>
+
+#if CV_VERSION_MAJOR != 4 || CV_VERSION_MINOR < 8
+#error "OpenCV 4.8 or a later 4: before, SIFT puts keypoints 0.25 px to the lower right"
+#endif
 
 namespace mambaloc {
 
@@ -76,8 +81,32 @@ class MapLocaliser {
     return answer;
   }
 
-  // The map's own camera, for a picture of another size but the same shape.
-  cv::Matx33d intrinsics(cv::Size picture) const { return rescaled(intrinsics_, size_, picture); }
+  // For a bridge to another language: height x width x 3 bytes, R G B; fx, fy, cx, cy in its pixels, or nullptr for the
+  // map's own camera; the network's pose as x y z qw qx qy qz, or nullptr. Returns the same 7 numbers, the inliers, and
+  // the covariance's 36; nothing where no pose is accepted, or the map's own camera does not have the picture's shape.
+  std::vector<double> localise(const uint8_t* rgb, int height, int width, const double* camera, const double* prior) const {
+    if (!camera && std::abs(width * size_.height - height * size_.width) > std::max(size_.width, size_.height)) return {};
+    const cv::Matx33d k = camera ? cv::Matx33d(camera[0], 0, camera[2], 0, camera[1], camera[3], 0, 0, 1)
+                                 : rescaled(intrinsics_, size_, {width, height});
+    CameraPose around;
+    if (prior) {
+      const double w = prior[3], x = prior[4], y = prior[5], z = prior[6];
+      around.position_m = {prior[0], prior[1], prior[2]};
+      around.rotation = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+                         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
+    }
+    const cv::Mat picture(height, width, CV_8UC3, const_cast<uint8_t*>(rgb));
+    const MapLocalisation found = localise(picture, k, prior ? &around : nullptr);
+    if (!found.accepted) return {};
+    cv::Vec3d turn;
+    cv::Rodrigues(found.pose.rotation, turn);
+    const double angle = cv::norm(turn), share = angle > 1e-12 ? std::sin(angle / 2) / angle : 0.5;
+    const cv::Vec3d p = found.pose.position_m, xyz = turn * share;
+    std::vector<double> flat{p[0], p[1], p[2], std::cos(angle / 2), xyz[0], xyz[1], xyz[2], double(found.inliers)};
+    flat.insert(flat.end(), found.covariance.val, found.covariance.val + 36);
+    return flat;
+  }
 
  private:
   struct Features {
@@ -115,7 +144,7 @@ class MapLocaliser {
     cv::cvtColor(rgb, grey, cv::COLOR_RGB2GRAY);
     if (size != grey.size()) cv::resize(grey, grey, size, 0, 0, cv::INTER_AREA);
     std::vector<cv::KeyPoint> keypoints;
-    // The last argument, the precise upscale, is new in OpenCV 4.8: before, keypoints lie 0.25 px to the lower right.
+    // The last argument is the precise upscale.
     cv::SIFT::create(1000, 3, 0.02, 10, 1.6, true)->detectAndCompute(grey, cv::noArray(), keypoints, found);
     const cv::Matx33d small = rescaled(k, rgb.size(), size);
     Features seen;
@@ -160,12 +189,11 @@ class MapLocaliser {
 
   bool ransac(const Features& seen, CameraPose& pose) const {
     if (seen.rays.empty()) return false;
-    const cv::Mat most_seen = descriptors_.rowRange(0, std::min(descriptors_.rows, 2500));
-    const std::vector<int> best = unambiguous(seen.descriptors * most_seen.t(), 0.85f);
+    const std::vector<int> best = unambiguous(seen.descriptors * often_descriptors_.t(), 0.85f);
     std::vector<cv::Vec3d> points;
     std::vector<cv::Vec2d> rays;
     for (size_t i = 0; i < best.size(); ++i)
-      if (best[i] >= 0) points.push_back(points_[best[i]]), rays.push_back(seen.rays[i]);
+      if (best[i] >= 0) points.push_back(points_[often_[best[i]]]), rays.push_back(seen.rays[i]);
     if (points.size() < 4) return false;
     cv::Vec3d turn, shift;
     std::vector<int> inliers;
@@ -185,7 +213,7 @@ class MapLocaliser {
   // Match again what the pose projects near a keypoint, of the points that one of the 8 nearest key frames sees.
   void search(const Features& seen, const CameraPose& pose, double radius, std::vector<cv::Vec3d>& points,
               std::vector<cv::Vec2d>& rays) const {
-    const Place here = place(pose);
+    const Place here = place(pose, unit_m_);
     std::vector<int> order(places_.size());
     std::iota(order.begin(), order.end(), 0);
     std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return apart(here, places_[a]) < apart(here, places_[b]); });
@@ -274,9 +302,9 @@ class MapLocaliser {
 
   using Place = cv::Vec<double, 6>;  // a move by the key frames' spread counts as much as a turn by 25 degrees
 
-  Place place(const CameraPose& pose) const {
-    const double metres = std::max(unit_m_, 1e-12), radians = 25 * CV_PI / 180;
-    const cv::Vec3d p = pose.position_m * (1 / metres);
+  static Place place(const CameraPose& pose, double unit_m) {
+    const double radians = 25 * CV_PI / 180;
+    const cv::Vec3d p = pose.position_m * (1 / std::max(unit_m, 1e-12));
     return {p[0], p[1], p[2], pose.rotation(0, 2) / radians, pose.rotation(1, 2) / radians, pose.rotation(2, 2) / radians};
   }
 
@@ -290,9 +318,9 @@ class MapLocaliser {
   // From the map's adjusted frame to that of the given poses (way 1), with the covariance of what is added; or back (-1).
   std::pair<CameraPose, cv::Matx66d> carried(const CameraPose& pose, int way) const {
     if (drift_.empty()) return {pose, cv::Matx66d::zeros()};
-    const Place here = place(pose);
-    cv::Mat near(1, int(places_.size()), CV_64F);
-    for (int k = 0; k < near.cols; ++k) near.at<double>(k) = kernel(here, places_[k]);
+    const Place here = place(pose, drift_unit_m_);
+    cv::Mat near(1, drift_.rows, CV_64F);
+    for (int k = 0; k < near.cols; ++k) near.at<double>(k) = kernel(here, drift_places_[k]);
     const cv::Mat move = near * drift_;
     const double* m = move.ptr<double>();
     const cv::Matx33d rotation = pose.rotation * turned(cv::Vec3d(m[3], m[4], m[5]) * way);
@@ -315,6 +343,8 @@ class MapLocaliser {
     const std::string text = json["__metadata__"]["about"];
     const cv::FileStorage about(text, from_text);
     if (int(about["version"]) != 1) throw std::runtime_error("map: is of another version");
+    const std::string kind = about["keypoints"];
+    if (!kind.empty() && kind != "sift") throw std::runtime_error("map: has " + kind + " keypoints, this reads sift");
     least_inliers_ = int(about["least_inliers"]);
     const auto array = [&](const char* name, int type, int columns) {
       const cv::FileNode entry = json[name];
@@ -333,7 +363,7 @@ class MapLocaliser {
     view_bytes_ = size_t(poses.rows + 7) / 8;
     const cv::Mat views = array("views", CV_8U, int(view_bytes_));
     if (points.empty() || stored.rows != points.rows || views.rows != points.rows || lens.rows != 1 || size.rows != 1 ||
-        (drift_.rows != 0 && drift_.rows != poses.rows))
+        drift_.rows > poses.rows)
       throw std::runtime_error("map: its arrays do not belong together");
     intrinsics_ = cv::Matx33d(array("intrinsics", CV_64F, 9).ptr<double>());
     size_ = {size.at<int>(0), size.at<int>(2)};  // int64, little-endian
@@ -346,34 +376,50 @@ class MapLocaliser {
       cv::Mat row = descriptors_.row(p);
       row *= 1 / std::max(cv::norm(row), 1.0);
     }
+    std::vector<int> counts(points_.size());
+    for (size_t i = 0; i < views_.size(); ++i) counts[i / view_bytes_] += int(std::bitset<8>(views_[i]).count());
+    often_.resize(points_.size());
+    std::iota(often_.begin(), often_.end(), 0);
+    std::stable_sort(often_.begin(), often_.end(), [&](int a, int b) { return counts[a] > counts[b]; });
+    often_.resize(std::min<size_t>(often_.size(), 2500));
+    for (int p : often_) often_descriptors_.push_back(descriptors_.row(p));
     std::vector<CameraPose> cameras;
-    cv::Vec3d mean(0, 0, 0);
     for (int k = 0; k < poses.rows; ++k) {
       const cv::Matx44d matrix(poses.ptr<double>(k));
       cameras.push_back({matrix.get_minor<3, 3>(0, 0), {matrix(0, 3), matrix(1, 3), matrix(2, 3)}});
-      mean += cameras.back().position_m * (1.0 / poses.rows);
     }
-    double squares = 0;
-    for (const auto& each : cameras) squares += cv::norm(each.position_m - mean, cv::NORM_L2SQR) / poses.rows;
-    unit_m_ = std::sqrt(squares);
-    for (const auto& each : cameras) places_.push_back(place(each));
+    unit_m_ = spread_m(cameras);
+    for (const auto& each : cameras) places_.push_back(place(each, unit_m_));
     if (drift_.empty()) return;
-    cv::Mat covariance(poses.rows, poses.rows, CV_64F);
-    for (int a = 0; a < poses.rows; ++a)
-      for (int b = 0; b < poses.rows; ++b) covariance.at<double>(a, b) = kernel(places_[a], places_[b]) + (a == b ? 1e-3 : 0);
+    cameras.resize(drift_.rows);  // those that were added to the map later have none
+    drift_unit_m_ = spread_m(cameras);
+    for (const auto& each : cameras) drift_places_.push_back(place(each, drift_unit_m_));
+    cv::Mat covariance(drift_.rows, drift_.rows, CV_64F);
+    for (int a = 0; a < drift_.rows; ++a)
+      for (int b = 0; b < drift_.rows; ++b)
+        covariance.at<double>(a, b) = kernel(drift_places_[a], drift_places_[b]) + (a == b ? 1e-3 : 0);
     inverse_ = covariance.inv(cv::DECOMP_CHOLESKY);
-    amplitude_ = cv::Matx66d(cv::Mat(drift_.t() * covariance * drift_ / poses.rows).ptr<double>());
+    amplitude_ = cv::Matx66d(cv::Mat(drift_.t() * covariance * drift_ / drift_.rows).ptr<double>());
+  }
+
+  static double spread_m(const std::vector<CameraPose>& cameras) {
+    cv::Vec3d mean(0, 0, 0);
+    for (const auto& each : cameras) mean += each.position_m * (1.0 / cameras.size());
+    double squares = 0;
+    for (const auto& each : cameras) squares += cv::norm(each.position_m - mean, cv::NORM_L2SQR) / cameras.size();
+    return std::sqrt(squares);
   }
 
   std::vector<cv::Vec3d> points_;
-  cv::Mat descriptors_, drift_, inverse_;
+  std::vector<int> often_;  // the points that most key frames see
+  cv::Mat descriptors_, often_descriptors_, drift_, inverse_;
   std::vector<uint8_t> views_;
   size_t view_bytes_ = 0;
-  std::vector<Place> places_;
+  std::vector<Place> places_, drift_places_;
   cv::Matx33d intrinsics_;
   cv::Matx66d amplitude_;
   cv::Size size_;
-  double focal_ = 1, radial_ = 0, near_ = 0, unit_m_ = 0;
+  double focal_ = 1, radial_ = 0, near_ = 0, unit_m_ = 0, drift_unit_m_ = 0;
   int least_inliers_ = 0;
 };
 
