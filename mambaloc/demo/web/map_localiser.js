@@ -1,0 +1,143 @@
+/** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localiser.py` finds it. No DOM. */
+
+import { project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
+import { matrixOf, median, quaternionOf } from "./geometry.js";
+import { matchAll, matchNearby } from "./matching.js";
+import { greyPicture } from "./pictures.js";
+import { detectFeatures } from "./sift.js";
+import { largestEigenvalue } from "./vectors.js";
+
+const AT_ONCE = 2500; // points, of those that most frames see, which are matched without a pose
+const RATIO = 0.85;
+const GUIDED = { ratio: 0.95, farthest: 0.9 };
+const NEAREST = 8; // key frames whose points are searched again
+const WINDOWS = [6, 2]; // radii of the guided rounds, in times of what is near
+const LEAST_SHARE = 0.1;
+const MOST_DEVIATION = 0.03; // of the key frames' spread
+const TURN = (25 * Math.PI) / 180; // radians that count as much as a move by the key frames' spread
+
+/** Localises pictures in a map. */
+export class MapLocaliser {
+  #map;
+  #seed;
+  #near; // in the plane at depth 1
+  #unit_m;
+  #viewpoints;
+
+  /**
+   * @param map of `readMap`.
+   * @param {number} seed of RANSAC.
+   */
+  constructor(map, seed = 0) {
+    this.#map = map;
+    this.#seed = seed;
+    this.#near = (4.5 * map.width) / 160 / map.intrinsics.fx;
+    const poses = Array.from({ length: map.key_poses.length / 16 }, (_, i) => map.key_poses.subarray(16 * i, 16 * i + 16));
+    const places = poses.map((pose) => [pose[3], pose[7], pose[11]]);
+    this.#unit_m = spreadOf(places);
+    this.#viewpoints = poses.map((pose, i) => this.#viewpoint(places[i], [pose[2], pose[6], pose[10]]));
+  }
+
+  /**
+   * Localise one picture.
+   * @param image as the network's localiser takes it, without distortion.
+   * @param {{fx: number, fy: number, cx: number, cy: number}|null} intrinsics in its pixels; the map's camera unless given.
+   * @param prior a pose to search around where all points at once find none.
+   * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `covariance` as in Python, and
+   *   `matches`: x and y of each in shares of the picture, and how far it is off, 1 being as far as inliers are. Null
+   *   where there is no pose.
+   */
+  localise(image, intrinsics = null, prior = null) {
+    const camera = intrinsics ?? this.#cameraOf(image);
+    const grey = greyPicture(image, this.#map.intrinsics.fx / camera.fx);
+    const features = withRays(detectFeatures(grey), grey, rescaled(camera, image, grey));
+    const found = this.#search(features, prior && { ...prior, rotation: matrixOf(prior.quaternion_wxyz) });
+    if (!found) return null;
+    const { pose, covariance, keypoints, off } = found;
+    const inliers = off.filter((each) => each <= this.#near).length;
+    const deviation_m = covariance ? Math.sqrt(largestEigenvalue(covariance)) : Infinity;
+    return {
+      position_m: pose.position_m,
+      quaternion_wxyz: quaternionOf(pose.rotation),
+      inliers,
+      isAccepted: inliers >= this.#map.about.least_inliers && deviation_m <= MOST_DEVIATION * this.#unit_m,
+      covariance,
+      matches: keypoints.map((row, i) => ({
+        x: (features.pixels[2 * row] + 0.5) / grey.width,
+        y: (features.pixels[2 * row + 1] + 0.5) / grey.height,
+        off: off[i] / this.#near,
+      })),
+    };
+  }
+
+  /** Match every point at once for a pose, then again around where it projects them. */
+  #search(features, prior) {
+    const { points_m, descriptors } = this.#map;
+    const near = this.#near;
+    const first = matchAll(features, descriptors, Math.min(AT_ONCE, points_m.length / 3), RATIO);
+    let pose = ransacPose(...this.#matched(features, first), near, this.#seed) ?? prior;
+    let [scale, found] = [near / 2, null]; // of the refinement; finer where the matches are
+    for (const window of pose ? WINDOWS : []) {
+      const projected = project(pose, points_m);
+      const limits = { radius: window * near, ...GUIDED };
+      const matches = matchNearby(features, this.#visible(features, pose, projected), projected, descriptors, limits);
+      if (matches.points.length < 4) return null;
+      const [seen_m, rays] = this.#matched(features, matches);
+      found = { ...refinePose(pose, seen_m, rays, scale), keypoints: matches.keypoints };
+      pose = found.pose;
+      found.off = residuals(pose, seen_m, rays);
+      scale = Math.min(near / 2, Math.max(2.5 * median(found.off.filter(Number.isFinite)), LEAST_SHARE * near));
+    }
+    return found;
+  }
+
+  #matched({ rays }, { keypoints, points }) {
+    return [selected(this.#map.points_m, points, 3), selected(rays, keypoints, 2)];
+  }
+
+  /** Points inside of the picture that one of the nearest key frames sees: what is hidden from there is not searched. */
+  #visible({ corners: [left, top, right, bottom] }, { rotation, position_m }, projected) {
+    const here = this.#viewpoint(position_m, [rotation[2], rotation[5], rotation[8]]);
+    const apart = this.#viewpoints.map((there) => there.reduce((sum, value, i) => sum + (value - here[i]) ** 2, 0));
+    const nearest = [...apart.keys()].sort((a, b) => apart[a] - apart[b]).slice(0, NEAREST);
+    const bytes = Math.ceil(this.#viewpoints.length / 8);
+    const visible = [];
+    for (let point = 0; 2 * point < projected.length; point++) {
+      const [x, y] = [projected[2 * point], projected[2 * point + 1]];
+      if (!(x >= left && x <= right && y >= top && y <= bottom)) continue;
+      const sees = (frame) => this.#map.views[point * bytes + (frame >> 3)] & (128 >> (frame & 7));
+      if (nearest.some(sees)) visible.push(point);
+    }
+    return visible;
+  }
+
+  #viewpoint(position_m, forward) {
+    return [...position_m.map((value) => value / Math.max(this.#unit_m, 1e-12)), ...forward.map((value) => value / TURN)];
+  }
+
+  #cameraOf(image) {
+    const { width, height, intrinsics } = this.#map;
+    if (Math.abs(image.width * height - image.height * width) > Math.max(width, height)) return null;
+    return rescaled(intrinsics, this.#map, image);
+  }
+}
+
+/** Root mean square of how far places are from their mean. */
+function spreadOf(places) {
+  const mean = [0, 1, 2].map((axis) => places.reduce((sum, place) => sum + place[axis], 0) / places.length);
+  const squares = places.map((place) => place.reduce((sum, value, axis) => sum + (value - mean[axis]) ** 2, 0));
+  return Math.sqrt(squares.reduce((a, b) => a + b, 0) / places.length);
+}
+
+/** A camera's intrinsics once a picture is resized; corners stay corners. */
+function rescaled({ fx, fy, cx, cy }, from, to) {
+  const [x, y] = [to.width / from.width, to.height / from.height];
+  return { fx: x * fx, fy: y * fy, cx: x * cx + (x - 1) / 2, cy: y * cy + (y - 1) / 2 };
+}
+
+/** Add where keypoints, and the picture's upper left and lower right corner, lie in the plane at depth 1. */
+function withRays(features, { width, height }, { fx, fy, cx, cy }) {
+  const rays = features.pixels.map((value, i) => (i % 2 ? (value - cy) / fy : (value - cx) / fx));
+  const corners = [(-0.5 - cx) / fx, (-0.5 - cy) / fy, (width - 0.5 - cx) / fx, (height - 0.5 - cy) / fy];
+  return { ...features, rays, corners };
+}

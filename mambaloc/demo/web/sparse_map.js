@@ -1,0 +1,50 @@
+/** A sparse map's file: points of a place and what they look like. No DOM. */
+
+const VERSION = 1;
+const TYPES = { F32: Float32Array, F64: Float64Array, U8: Uint8Array, I64: BigInt64Array };
+const DESCRIPTOR = 128;
+
+/**
+ * Read what `mambaloc/runtime/maps/sparse_map.py` wrote: safetensors, whose header says where each array lies.
+ * @param {Uint8Array} bytes of the whole file.
+ * @returns the arrays by their names there, row by row, descriptors as floats of unit length; and `about`.
+ */
+export function readMap(bytes) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const start = 8 + Number(view.getBigUint64(0, true));
+  const { __metadata__: metadata, ...arrays } = JSON.parse(new TextDecoder().decode(bytes.subarray(8, start)));
+  const about = JSON.parse(metadata.about);
+  if (about.version > VERSION) {
+    throw new Error(`The map is of version ${about.version}, and this page reads up to ${VERSION}. Update the page.`);
+  }
+  const array = (name) => {
+    const { dtype, data_offsets: [from, to] } = arrays[name];
+    return new TYPES[dtype](bytes.slice(start + from, start + to).buffer);
+  };
+  const [width, height] = Array.from(array("size"), Number);
+  return {
+    about,
+    points_m: Float64Array.from(array("points_m")),
+    descriptors: ofUnitLength(array("descriptors")),
+    views: array("views"),
+    key_poses: array("key_poses"),
+    intrinsics: intrinsicsOf(array("intrinsics")),
+    width,
+    height,
+  };
+}
+
+/** Focal lengths and centre of a pinhole matrix of nine numbers. */
+function intrinsicsOf([fx, skew, cx, , fy, cy]) {
+  return { fx, fy, cx, cy, skew };
+}
+
+function ofUnitLength(bytes) {
+  const descriptors = Float32Array.from(bytes);
+  for (let from = 0; from < descriptors.length; from += DESCRIPTOR) {
+    const one = descriptors.subarray(from, from + DESCRIPTOR);
+    const length = Math.sqrt(one.reduce((sum, value) => sum + value * value, 0));
+    for (let i = 0; i < DESCRIPTOR; i++) one[i] /= Math.max(length, 1);
+  }
+  return descriptors;
+}
