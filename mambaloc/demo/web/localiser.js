@@ -1,67 +1,73 @@
 /**
- * Poses from pictures with an exported model. No DOM: the same file runs in a browser's worker and in Node.
+ * Poses from pictures with an exported network, and a sparse map beside it where the bundle has one. No DOM: the same
+ * file runs in a browser's worker and in Node.
  */
 
-import { Preprocessor, resizedSize } from "./pictures.js";
+import { MapLocaliser } from "./map_localiser.js";
+import { Network } from "./network.js";
 
 const CONTRACT_VERSION = 1;
 const MODELS = ["model.onnx", "model.fp16.onnx", "model.int8.onnx", "model.ort"];
-const UNCERTAINTY = ["position_radius_m", "rotation_radius_deg", "unfamiliarity"];
+const LEVEL_SIGMAS = 1.2815515655446004; // nine tenths of a normal variable are below
 
-/** A model on ONNX Runtime. */
+/** A network, and a map. */
 export class Localiser {
-  #ort;
-  #session;
-  #contract;
-  #preprocessor;
+  #network;
+  #map;
 
-  constructor(ort, session, contract) {
-    this.#ort = ort;
-    this.#session = session;
-    this.#contract = contract;
-    this.#preprocessor = new Preprocessor(contract.preprocessing);
+  constructor(network, map = null) {
+    this.#network = network;
+    this.#map = map;
   }
 
   /**
    * @param ort onnxruntime-web or onnxruntime-node.
    * @param {Uint8Array} modelBytes of a model of the bundle.
    * @param {object} contract the parsed `contract.json` beside it.
+   * @param {object|null} map of `readMap`.
    * @param {object} options of the inference session.
    */
-  static async create(ort, modelBytes, contract, options = {}) {
+  static async create(ort, modelBytes, contract, map = null, options = {}) {
     checkContract(contract);
-    return new Localiser(ort, await ort.InferenceSession.create(modelBytes, options), contract);
+    const network = await Network.create(ort, modelBytes, contract, options);
+    return new Localiser(network, map && new MapLocaliser(map));
   }
 
   /**
-   * Localise one picture.
+   * Localise one picture: the map's pose where it is accepted, the network's otherwise.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
-   * @returns `world_from_cam`: the camera centre in metres, a unit quaternion wxyz, and what it took; where the model
-   *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for a picture of elsewhere.
+   * @param {number[][]|null} intrinsics pinhole matrix in its pixels, for the map; the map's camera unless given.
+   * @returns as {@link Network#localise}; and `source`, "map" or "network"; `network`, its own answer; where there is a
+   *   map, `map`, its answer or null, and `map_ms`. Where the map answers, the radii are from its covariance.
    */
-  async localise(image) {
+  async localise(image, intrinsics = null) {
+    const network = await this.#network.localise(image);
+    if (!this.#map) return { ...network, source: "network", network };
     const start = performance.now();
-    const tensor = this.#tensor(image);
-    const fed = performance.now();
-    const found = await this.#session.run({ [this.#contract.input.name]: tensor });
-    const position_m = Array.from(found.position_m.data.slice(0, 3), Number);
-    const quaternion_wxyz = Array.from(found.quaternion_wxyz.data.slice(0, 4), Number);
-    if (![...position_m, ...quaternion_wxyz].every(Number.isFinite)) {
-      throw new Error("The network answered with numbers that are not finite; choose the other backend.");
-    }
-    const told = UNCERTAINTY.filter((name) => name in found).map((name) => [name, Number(found[name].data[0])]);
-    const took = { preprocess_ms: fed - start, network_ms: performance.now() - fed };
-    return { position_m, quaternion_wxyz, ...Object.fromEntries(told), ...took };
+    const map = this.#map.localise(image, intrinsics, network);
+    const both = { ...network, source: "network", network, map, map_ms: performance.now() - start };
+    if (!map?.isAccepted) return both;
+    const [position, rotation] = [0, 3].map((from) => covarianceRadius(map.covariance, from));
+    return {
+      ...both,
+      source: "map",
+      position_m: map.position_m,
+      quaternion_wxyz: map.quaternion_wxyz,
+      position_radius_m: position,
+      rotation_radius_deg: (rotation * 180) / Math.PI,
+    };
   }
+}
 
-  #tensor(image) {
-    if (this.#contract.preprocessing.in_model) {
-      resizedSize(image, this.#contract.preprocessing);
-      return new this.#ort.Tensor("uint8", asRgb(image), [image.height, image.width, 3]);
-    }
-    const [height, width] = this.#contract.preprocessing.crop;
-    return new this.#ort.Tensor("float32", this.#preprocessor.apply(image), [1, 3, height, width]);
-  }
+/**
+ * The radius of the ball that nine of ten errors of a covariance stay in, for three of its rows: Satterthwaite's
+ * approximation, as `mambaloc/runtime/maps/radii.py` has it.
+ */
+function covarianceRadius(covariance, from) {
+  const part = covariance.slice(from, from + 3).map((row) => row.slice(from, from + 3));
+  const mean = part[0][0] + part[1][1] + part[2][2];
+  const share = (2 * part.flat().reduce((sum, value) => sum + value * value, 0)) / (9 * mean * mean);
+  return Math.sqrt(mean * (1 - share + LEVEL_SIGMAS * Math.sqrt(share)) ** 3);
 }
 
 /** How far pose `a` is from pose `b`: millimetres and degrees. */
@@ -89,15 +95,4 @@ export function modelOf(contract) {
   const found = MODELS.find((file) => file in contract.files);
   if (!found) throw new Error(`The bundle holds none of ${MODELS.join(", ")}; export it anew.`);
   return found;
-}
-
-function asRgb({ data, width, height, channels }) {
-  if (channels === 3) return data instanceof Uint8Array ? data : new Uint8Array(data);
-  const rgb = new Uint8Array(width * height * 3);
-  for (let from = 0, to = 0; to < rgb.length; from += 4, to += 3) {
-    rgb[to] = data[from];
-    rgb[to + 1] = data[from + 1];
-    rgb[to + 2] = data[from + 2];
-  }
-  return rgb;
 }

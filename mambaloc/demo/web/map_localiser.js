@@ -5,6 +5,7 @@ import { matrixOf, median, quaternionOf } from "./geometry.js";
 import { matchAll, matchNearby } from "./matching.js";
 import { greyPicture } from "./pictures.js";
 import { detectFeatures } from "./sift.js";
+import { cameraOf } from "./sparse_map.js";
 import { largestEigenvalue } from "./vectors.js";
 
 const AT_ONCE = 2500; // points, of those that most frames see, which are matched without a pose
@@ -41,19 +42,20 @@ export class MapLocaliser {
   /**
    * Localise one picture.
    * @param image as the network's localiser takes it, without distortion.
-   * @param {{fx: number, fy: number, cx: number, cy: number}|null} intrinsics in its pixels; the map's camera unless given.
+   * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the map's camera unless given.
    * @param prior a pose to search around where all points at once find none.
    * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `covariance` as in Python, and
-   *   `matches`: x and y of each in shares of the picture, and how far it is off, 1 being as far as inliers are. Null
-   *   where there is no pose.
+   *   `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers. Null
+   *   where there is no pose, or the picture has another shape than the map's, so that its camera is unknown.
    */
   localise(image, intrinsics = null, prior = null) {
-    const camera = intrinsics ?? this.#cameraOf(image);
+    const camera = intrinsics ? cameraOf(intrinsics.flat()) : this.#cameraFor(image);
+    if (!camera) return null;
     const grey = greyPicture(image, this.#map.intrinsics.fx / camera.fx);
     const features = withRays(detectFeatures(grey), grey, rescaled(camera, image, grey));
     const found = this.#search(features, prior && { ...prior, rotation: matrixOf(prior.quaternion_wxyz) });
     if (!found) return null;
-    const { pose, covariance, keypoints, off } = found;
+    const { pose, covariance, keypoints, points, off } = found;
     const inliers = off.filter((each) => each <= this.#near).length;
     const deviation_m = covariance ? Math.sqrt(largestEigenvalue(covariance)) : Infinity;
     return {
@@ -63,6 +65,7 @@ export class MapLocaliser {
       isAccepted: inliers >= this.#map.about.least_inliers && deviation_m <= MOST_DEVIATION * this.#unit_m,
       covariance,
       matches: keypoints.map((row, i) => ({
+        point: points[i],
         x: (features.pixels[2 * row] + 0.5) / grey.width,
         y: (features.pixels[2 * row + 1] + 0.5) / grey.height,
         off: off[i] / this.#near,
@@ -83,7 +86,7 @@ export class MapLocaliser {
       const matches = matchNearby(features, this.#visible(features, pose, projected), projected, descriptors, limits);
       if (matches.points.length < 4) return null;
       const [seen_m, rays] = this.#matched(features, matches);
-      found = { ...refinePose(pose, seen_m, rays, scale), keypoints: matches.keypoints };
+      found = { ...refinePose(pose, seen_m, rays, scale), ...matches };
       pose = found.pose;
       found.off = residuals(pose, seen_m, rays);
       scale = Math.min(near / 2, Math.max(2.5 * median(found.off.filter(Number.isFinite)), LEAST_SHARE * near));
@@ -115,7 +118,7 @@ export class MapLocaliser {
     return [...position_m.map((value) => value / Math.max(this.#unit_m, 1e-12)), ...forward.map((value) => value / TURN)];
   }
 
-  #cameraOf(image) {
+  #cameraFor(image) {
     const { width, height, intrinsics } = this.#map;
     if (Math.abs(image.width * height - image.height * width) > Math.max(width, height)) return null;
     return rescaled(intrinsics, this.#map, image);

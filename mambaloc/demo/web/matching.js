@@ -1,6 +1,6 @@
 /** Matches between a picture's keypoints and a map's points. No DOM. */
 
-const DESCRIPTOR = 128;
+import { LENGTH } from "./descriptors.js";
 
 /**
  * Match keypoints with so many points at once, each that is clearly nearer to its best than to its second best.
@@ -40,15 +40,20 @@ export function matchNearby(features, visible, projected, descriptors, { radius,
   const nearest = new Map(); // of each point, its keypoint and their similarity
   const found = [];
   for (let keypoint = 0; keypoint < features.count; keypoint++) {
-    let [best, first, second] = [-1, -1, -1];
+    let best = -1;
+    let first = -1;
+    let second = -1;
     for (const point of visible) {
       const x = features.rays[2 * keypoint] - projected[2 * point];
       const y = features.rays[2 * keypoint + 1] - projected[2 * point + 1];
       if (x * x + y * y > radius * radius) continue;
       const similarity = product(features.descriptors, keypoint, descriptors, point);
       if (!(nearest.get(point)?.similarity >= similarity)) nearest.set(point, { keypoint, similarity });
-      if (similarity > first) [best, first, second] = [point, similarity, first];
-      else if (similarity > second) second = similarity;
+      if (similarity > first) {
+        second = first;
+        first = similarity;
+        best = point;
+      } else if (similarity > second) second = similarity;
     }
     if (best >= 0 && distance(first) < Math.min(farthest, ratio * distance(second))) found.push([keypoint, best]);
   }
@@ -67,41 +72,59 @@ function distance(similarity) {
 
 function product(a, row, b, column) {
   let sum = 0;
-  for (let i = row * DESCRIPTOR, j = column * DESCRIPTOR; i < (row + 1) * DESCRIPTOR; i++, j++) sum += a[i] * b[j];
+  for (let i = row * LENGTH, j = column * LENGTH; i < (row + 1) * LENGTH; i++, j++) sum += a[i] * b[j];
   return sum;
 }
 
 /** Products of two keypoints with points, four at a time: each number that is loaded counts several times. */
 function similarities(keypoints, [one, other], points, [toOne, toOther]) {
-  const [a, b, step] = [one * DESCRIPTOR, other * DESCRIPTOR, DESCRIPTOR];
-  const count = toOne.length;
+  const a = one * LENGTH;
+  const b = other * LENGTH;
   let point = 0;
-  for (let at = 0; point + 4 <= count; point += 4, at += 4 * step) {
-    let [a0, a1, a2, a3, b0, b1, b2, b3] = [0, 0, 0, 0, 0, 0, 0, 0];
-    for (let i = 0; i < step; i++) {
-      const x = keypoints[a + i];
-      const y = keypoints[b + i];
-      const [p, q, r, s] = [points[at + i], points[at + i + step], points[at + i + 2 * step], points[at + i + 3 * step]];
-      a0 += x * p;
-      a1 += x * q;
-      a2 += x * r;
-      a3 += x * s;
-      b0 += y * p;
-      b1 += y * q;
-      b2 += y * r;
-      b3 += y * s;
+  for (; point + 4 <= toOne.length; point += 4) {
+    const p = point * LENGTH;
+    const q = p + LENGTH;
+    const r = q + LENGTH;
+    const s = r + LENGTH;
+    let ap = 0;
+    let aq = 0;
+    let ar = 0;
+    let as = 0;
+    let bp = 0;
+    let bq = 0;
+    let br = 0;
+    let bs = 0;
+    for (let i = 0; i < LENGTH; i++) {
+      const ofA = keypoints[a + i];
+      const ofB = keypoints[b + i];
+      ap += ofA * points[p + i];
+      aq += ofA * points[q + i];
+      ar += ofA * points[r + i];
+      as += ofA * points[s + i];
+      bp += ofB * points[p + i];
+      bq += ofB * points[q + i];
+      br += ofB * points[r + i];
+      bs += ofB * points[s + i];
     }
-    toOne.set([a0, a1, a2, a3], point);
-    toOther.set([b0, b1, b2, b3], point);
+    toOne[point] = ap;
+    toOne[point + 1] = aq;
+    toOne[point + 2] = ar;
+    toOne[point + 3] = as;
+    toOther[point] = bp;
+    toOther[point + 1] = bq;
+    toOther[point + 2] = br;
+    toOther[point + 3] = bs;
   }
-  for (; point < count; point++) {
+  for (; point < toOne.length; point++) {
     toOne[point] = product(keypoints, one, points, point);
     toOther[point] = product(keypoints, other, points, point);
   }
 }
 
 function bestTwo(similarity) {
-  let [best, first, second] = [0, -1, -1];
+  let best = 0;
+  let first = -1;
+  let second = -1;
   for (let i = 0; i < similarity.length; i++) {
     if (similarity[i] > first) {
       second = first;

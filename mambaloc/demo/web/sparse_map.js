@@ -1,8 +1,9 @@
 /** A sparse map's file: points of a place and what they look like. No DOM. */
 
+import { LENGTH } from "./descriptors.js";
+
 const VERSION = 1;
 const TYPES = { F32: Float32Array, F64: Float64Array, U8: Uint8Array, I64: BigInt64Array };
-const DESCRIPTOR = 128;
 
 /**
  * Read what `mambaloc/runtime/maps/sparse_map.py` wrote: safetensors, whose header says where each array lies.
@@ -28,23 +29,23 @@ export function readMap(bytes) {
     descriptors: ofUnitLength(array("descriptors")),
     views: array("views"),
     key_poses: array("key_poses"),
-    intrinsics: intrinsicsOf(array("intrinsics")),
+    intrinsics: cameraOf(array("intrinsics")),
     width,
     height,
   };
 }
 
 /** Focal lengths and centre of a pinhole matrix of nine numbers. */
-function intrinsicsOf([fx, skew, cx, , fy, cy]) {
-  return { fx, fy, cx, cy, skew };
+export function cameraOf([fx, , cx, , fy, cy]) {
+  return { fx, fy, cx, cy };
 }
 
 function ofUnitLength(bytes) {
   const descriptors = Float32Array.from(bytes);
-  for (let from = 0; from < descriptors.length; from += DESCRIPTOR) {
-    const one = descriptors.subarray(from, from + DESCRIPTOR);
+  for (let from = 0; from < descriptors.length; from += LENGTH) {
+    const one = descriptors.subarray(from, from + LENGTH);
     const length = Math.sqrt(one.reduce((sum, value) => sum + value * value, 0));
-    for (let i = 0; i < DESCRIPTOR; i++) one[i] /= Math.max(length, 1);
+    for (let i = 0; i < LENGTH; i++) one[i] /= Math.max(length, 1);
   }
   return descriptors;
 }
