@@ -45,11 +45,6 @@ export function greyPicture({ data, width, height, channels }, scale) {
   return { values: averaged(values, 0, 1, width, areas), width: across, height: down };
 }
 
-/** As {@link Preprocessor#apply}, once. */
-export function preprocess(image, preprocessing) {
-  return new Preprocessor(preprocessing).apply(image);
-}
-
 /**
  * [height, width] of an image once its shorter side has `short_side` pixels.
  *
