@@ -11,7 +11,8 @@ const found = {
   three: three.map(({ points, rays }) => posesOfThree(points, rays)),
   many: many.map(({ points, rays, near, start }) => {
     const [flatPoints, flatRays] = [points, rays].map((rows) => Float64Array.from(rows.flat()));
-    return { ransac: ransacPose(flatPoints, flatRays, near, 0), refined: start && refinePose(start, flatPoints, flatRays, near) };
+    const refined = start && refinePose(start, flatPoints, flatRays, near);
+    return { ransac: ransacPose(flatPoints, flatRays, near, 0), refined };
   }),
 };
 console.log(JSON.stringify(found));

@@ -113,7 +113,10 @@ def solved():
         rotation, position_m, points, rays = random_problem(rng, 90)
         seen = rays + rng.normal(0, 0.002, rays.shape)
         seen[:30] = rng.uniform(-0.6, 0.6, (30, 2))
-        start = (rotation @ Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix(), position_m + rng.normal(0, 0.03, 3))
+        start = (
+            rotation @ Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix(),
+            position_m + rng.normal(0, 0.03, 3),
+        )
         manies.append((rotation, position_m, points, seen, start))
     line = np.outer([1.0, 2.0, 3.0], [1.0, 0.5, 2.0])
     asked = {

@@ -38,8 +38,8 @@ function inWords(map, file) {
   if (!map) return "";
   const focal = (map.intrinsics[0][0] / map.size[0]).toFixed(2);
   return (
-    `${map.points} points of ${map.key_frames} key frames, ${(file.bytes / 1e6).toFixed(1)} MB. Pictures are taken for ` +
-    `its camera's, without distortion, focal length ${focal} of the width`
+    `${map.points} points of ${map.key_frames} key frames, ${(file.bytes / 1e6).toFixed(1)} MB. Pictures are taken ` +
+    `to be of its camera, without distortion, focal length ${focal} of the width`
   );
 }
 

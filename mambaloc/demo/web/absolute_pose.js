@@ -2,12 +2,12 @@
  * The pose of a camera from points and where it sees them: RANSAC, and least squares, as
  * `mambaloc/runtime/maps/absolute_pose.py` does it. No DOM.
  *
- * A pose is `world_from_cam`: `rotation`, nine numbers row by row, and `position_m`, three. Points lie one after another
- * in a flat array, x, y, z in metres; rays x, y in the plane at depth 1.
+ * A pose is `world_from_cam`: `rotation`, nine numbers row by row, and `position_m`, three. Points lie one after
+ * another in a flat array, x, y, z in metres; rays x, y in the plane at depth 1.
  */
 
 import { posesOfThree } from "./three_points.js";
-import { cross, solved, unit } from "./vectors.js";
+import { cross, dot, solved, unit } from "./vectors.js";
 
 const TRIALS = 1000;
 const CONFIDENCE = 0.9999;
@@ -62,7 +62,8 @@ export function ransacPose(points, rays, near, seed) {
   if (!best) return null;
   const off = residuals(best, points, rays);
   const agreeing = [...off.keys()].filter((i) => off[i] <= near);
-  return agreeing.length < 4 ? null : refinePose(best, selected(points, agreeing, 3), selected(rays, agreeing, 2), near).pose;
+  if (agreeing.length < 4) return null;
+  return refinePose(best, selected(points, agreeing, 3), selected(rays, agreeing, 2), near).pose;
 }
 
 /** Rows of a flat array of so many columns. */
@@ -96,8 +97,8 @@ function randomNumbers(seed) {
  * Least squares of all matches with Cauchy's weights, by Levenberg-Marquardt.
  * @param start a pose from which the points lie in front.
  * @param {number} near a match that is off by half of it has half the weight.
- * @returns {{pose: object, covariance: number[][]|null}} of the position in metres, then of the rotation in radians about
- *   the world's axes; null where the matches leave something open.
+ * @returns {{pose: object, covariance: number[][]|null}} of the position in metres, then of the rotation in radians
+ *   about the world's axes; null where the matches leave something open.
  */
 export function refinePose(start, points, rays, near) {
   let [pose, damping, now] = [start, 1e-4, normalEquations(start, points, rays, near)];
@@ -143,7 +144,7 @@ function normalEquations({ rotation: r, position_m: [px, py, pz] }, points, rays
   let [cost, squares] = [0, 0];
   for (let i = 0, j = 0; i < rays.length; i += 2, j += 3) {
     const towards = [points[j] - px, points[j + 1] - py, points[j + 2] - pz];
-    const [x, y, depth] = [0, 1, 2].map((axis) => r[axis] * towards[0] + r[3 + axis] * towards[1] + r[6 + axis] * towards[2]);
+    const [x, y, depth] = [0, 1, 2].map((axis) => dot([r[axis], r[3 + axis], r[6 + axis]], towards));
     if (depth <= LEAST_DEPTH) return { cost: Infinity, normal, right, spread: Infinity };
     const seen = [x / depth, y / depth];
     const off = seen.map((value, axis) => ((value - rays[i + axis]) * 2) / near);

@@ -8,7 +8,7 @@ const DIRECTIONS = 8; // a cell
 const CELL_SIGMAS = 3; // side of a cell in the keypoint's scale
 const LARGEST_SHARE = 0.2; // of a descriptor's length, that one number may have
 const TURN = 2 * Math.PI;
-const ARC = [0.99986633, -0.33030475, 0.18015914, -0.08515611, 0.02084499]; // the best odd polynomial for the arctangent
+const ARC = [0.99986633, -0.33030475, 0.18015914, -0.08515611, 0.02084499]; // best odd polynomial for the arctangent
 
 /** The directions, from x towards y in radians, of most gradients about an extremum. */
 export function orientationsOf({ image, column, row, scale }) {
@@ -55,7 +55,8 @@ function peaksOf(histogram) {
   const peaks = [];
   histogram.forEach((value, i) => {
     const [left, right] = [histogram[(i + BINS - 1) % BINS], histogram[(i + 1) % BINS]];
-    if (value > left && value > right && value >= least) peaks.push(i + (0.5 * (left - right)) / (left - 2 * value + right));
+    if (value <= left || value <= right || value < least) return;
+    peaks.push(i + (0.5 * (left - right)) / (left - 2 * value + right));
   });
   return peaks;
 }

@@ -4,7 +4,8 @@ import { deviation, modelOf } from "./localiser.js";
 import { small } from "./readout.js";
 
 /**
- * How far the network's pose of a test frame is from the one in the contract, and then, where the map has one, the map's.
+ * How far the network's pose of a test frame is from the one in the contract, and after it, where the map has one, the
+ * map's.
  * @returns {{name: string, mm: number, deg: number, allowed: object, within: boolean}[]}
  */
 export function deviations(pose, frame, contract) {
@@ -51,7 +52,8 @@ export class TestFrames {
       if (!own.length) return [];
       const [mm, deg] = ["mm", "deg"].map((unit) => small(Math.max(...own.map((one) => one[unit])), 3));
       const { position_mm, rotation_deg } = own[0].allowed;
-      return [`${name} ${mm} mm and ${deg}° at worst over ${own.length} frames; ${position_mm} mm and ${rotation_deg}° are allowed`];
+      const limits = `${position_mm} mm and ${rotation_deg}° are allowed`;
+      return [`${name} ${mm} mm and ${deg}° at worst over ${own.length} frames; ${limits}`];
     });
     const within = found.every((one) => one.within);
     this.#verdict.dataset.within = String(within);

@@ -6,7 +6,7 @@ import { matchAll, matchNearby } from "./matching.js";
 import { greyPicture } from "./pictures.js";
 import { detectFeatures } from "./sift.js";
 import { cameraOf } from "./sparse_map.js";
-import { largestEigenvalue } from "./vectors.js";
+import { largestEigenvalue, scaled } from "./vectors.js";
 
 const AT_ONCE = 2500; // points, of those that most frames see, which are matched without a pose
 const RATIO = 0.85;
@@ -33,7 +33,8 @@ export class MapLocaliser {
     this.#map = map;
     this.#seed = seed;
     this.#near = (4.5 * map.width) / 160 / map.intrinsics.fx;
-    const poses = Array.from({ length: map.key_poses.length / 16 }, (_, i) => map.key_poses.subarray(16 * i, 16 * i + 16));
+    const count = map.key_poses.length / 16;
+    const poses = Array.from({ length: count }, (_, i) => map.key_poses.subarray(16 * i, 16 * i + 16));
     const places = poses.map((pose) => [pose[3], pose[7], pose[11]]);
     this.#unit_m = spreadOf(places);
     this.#viewpoints = poses.map((pose, i) => this.#viewpoint(places[i], [pose[2], pose[6], pose[10]]));
@@ -45,8 +46,8 @@ export class MapLocaliser {
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the map's camera unless given.
    * @param prior a pose to search around where all points at once find none.
    * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `covariance` as in Python, and
-   *   `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers. Null
-   *   where there is no pose, or the picture has another shape than the map's, so that its camera is unknown.
+   *   `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers.
+   *   Null where there is no pose, or the picture has another shape than the map's, so that its camera is unknown.
    */
   localise(image, intrinsics = null, prior = null) {
     const camera = intrinsics ? cameraOf(intrinsics.flat()) : this.#cameraFor(image);
@@ -98,7 +99,7 @@ export class MapLocaliser {
     return [selected(this.#map.points_m, points, 3), selected(rays, keypoints, 2)];
   }
 
-  /** Points inside of the picture that one of the nearest key frames sees: what is hidden from there is not searched. */
+  /** Points in the picture that one of the nearest key frames sees: what is hidden from there is not searched. */
   #visible({ corners: [left, top, right, bottom] }, { rotation, position_m }, projected) {
     const here = this.#viewpoint(position_m, [rotation[2], rotation[5], rotation[8]]);
     const apart = this.#viewpoints.map((there) => there.reduce((sum, value, i) => sum + (value - here[i]) ** 2, 0));
@@ -115,7 +116,7 @@ export class MapLocaliser {
   }
 
   #viewpoint(position_m, forward) {
-    return [...position_m.map((value) => value / Math.max(this.#unit_m, 1e-12)), ...forward.map((value) => value / TURN)];
+    return [...scaled(position_m, 1 / Math.max(this.#unit_m, 1e-12)), ...scaled(forward, 1 / TURN)];
   }
 
   #cameraFor(image) {

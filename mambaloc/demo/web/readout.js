@@ -76,7 +76,8 @@ export class Readout {
     row.hidden = map === undefined;
     Object.assign(this.#element.dataset, { answer: source, inliers: map?.inliers ?? 0 });
     shown("answer").textContent = source;
-    shown("answer-detail").textContent = map ? `${map.inliers} of ${map.matches.length} matches agree` : "no pose in the map";
+    const agree = map && `${map.inliers} of ${map.matches.length} matches agree`;
+    shown("answer-detail").textContent = agree || "no pose in the map";
     row.querySelector(".scale").hidden = source !== "map";
   }
 

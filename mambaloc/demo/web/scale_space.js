@@ -8,7 +8,8 @@ const CAMERA_SIGMA = 0.5; // that pictures come with
 /** Octaves from twice the picture's size down: blurred layers and their differences. `pixel` is a pixel's size. */
 export function octavesOf(grey) {
   const sigmas = Array.from({ length: LAYERS + 3 }, (_, i) => SIGMA * 2 ** (i / LAYERS));
-  const kernels = sigmas.map((sigma, i) => gaussian(Math.sqrt(sigma ** 2 - (i ? sigmas[i - 1] : 2 * CAMERA_SIGMA) ** 2)));
+  const before = [2 * CAMERA_SIGMA, ...sigmas]; // the picture is doubled first
+  const kernels = sigmas.map((sigma, i) => gaussian(Math.sqrt(sigma ** 2 - before[i] ** 2)));
   let base = blurred(doubled(grey), kernels[0]);
   const octaves = [];
   for (let pixel = 0.5; Math.min(base.width, base.height) > 2 * BORDER; pixel *= 2) {

@@ -1,8 +1,8 @@
 /**
  * SIFT (Lowe 2004) with RootSIFT descriptors (Arandjelović and Zisserman 2012). No DOM.
  *
- * Its keypoints are those of OpenCV's `SIFT_create(1000, contrastThreshold=0.02, enable_precise_upscale=True)`, by which
- * maps are built, so that one map serves Python and the page; tests/demo/test_map.py compares them.
+ * Its keypoints are those of OpenCV's `SIFT_create(1000, contrastThreshold=0.02, enable_precise_upscale=True)`, by
+ * which maps are built, so that one map serves Python and the page; tests/demo/test_map_in_node.py compares them.
  */
 
 import { LENGTH, describe, orientationsOf } from "./descriptors.js";
@@ -17,8 +17,8 @@ const FIT_STEPS = 5;
 /**
  * Find the keypoints of a grey picture.
  * @param {{values: Uint8Array|Float32Array, width: number, height: number}} grey in 0..255.
- * @returns {{count: number, pixels: Float64Array, descriptors: Float32Array}} x, y of each keypoint, where the centre of
- *   the top left pixel is (0, 0), and 128 numbers of unit length.
+ * @returns {{count: number, pixels: Float64Array, descriptors: Float32Array}} x, y of each keypoint, where the centre
+ *   of the top left pixel is (0, 0), and 128 numbers of unit length.
  */
 export function detectFeatures(grey) {
   const keypoints = [];
@@ -84,7 +84,9 @@ function fitted(octave, layer, x, y) {
     const [gradient, hessian, value] = derivatives(octave.differences, layer, y * width + x, width);
     const offset = solved3(hessian, gradient)?.map((each) => -each);
     if (!offset) return null;
-    if (offset.every((each) => Math.abs(each) < 0.5)) return judged(octave, layer, x, y, offset, gradient, hessian, value);
+    if (offset.every((each) => Math.abs(each) < 0.5)) {
+      return judged(octave, [x, y, layer], offset, gradient, hessian, value);
+    }
     [x, y, layer] = [x, y, layer].map((each, i) => each + Math.round(offset[i]));
     const inside = x >= BORDER && x < width - BORDER && y >= BORDER && y < height - BORDER;
     if (!inside || !(layer >= 1 && layer <= LAYERS)) return null;
@@ -92,7 +94,8 @@ function fitted(octave, layer, x, y) {
   return null;
 }
 
-function judged({ pixel, layers }, layer, column, row, [dx, dy, dLayer], gradient, hessian, value) {
+/** A keypoint, unless its peak is weak or it lies on an edge: then null. */
+function judged({ pixel, layers }, [column, row, layer], [dx, dy, dLayer], gradient, hessian, value) {
   const peak = value + 0.5 * (gradient[0] * dx + gradient[1] * dy + gradient[2] * dLayer);
   const [[xx, xy], [, yy]] = hessian;
   const determinant = xx * yy - xy * xy;
