@@ -136,9 +136,10 @@ def test_three_points_give_the_true_pose_among_at_most_four(solved):
     exact = 0
     for (rotation, position_m, points, rays), poses in zip(threes, answer["three"], strict=False):
         assert 1 <= len(poses) <= 4
-        for pose in poses:  # each is a pose from which the points lie on their rays
+        for pose in poses:
             cam = (points - pose["position_m"]) @ np.reshape(pose["rotation"], (3, 3))
             assert (cam[:, 2] > 0).all()
+            np.testing.assert_allclose(cam[:, :2] / cam[:, 2:], rays, atol=1e-3)
             np.testing.assert_allclose(np.linalg.det(np.reshape(pose["rotation"], (3, 3))), 1, atol=1e-6)
         exact += any(
             np.allclose(pose["position_m"], position_m, atol=1e-3)

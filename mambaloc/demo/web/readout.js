@@ -102,12 +102,13 @@ export class Readout {
     const { mm, deg } = deviation(pose, truth);
     this.#errors.push({ mm, deg });
     const [middleMm, middleDeg] = ["mm", "deg"].map((unit) => median(this.#errors.map((error) => error[unit])));
+    const digits = pose.source === "map" ? 2 : 1;
     const frames = `${this.#errors.length} ${this.#errors.length === 1 ? "frame" : "frames"}`;
     this.#showErrors(
       "Error",
       `${(mm / 1000).toFixed(3)} m`,
-      `${deg.toFixed(1)}°`,
-      `median of ${frames}: ${(middleMm / 1000).toFixed(3)} m, ${middleDeg.toFixed(1)}°`,
+      `${deg.toFixed(digits)}°`,
+      `median of ${frames}: ${(middleMm / 1000).toFixed(3)} m, ${middleDeg.toFixed(digits)}°`,
     );
   }
 
