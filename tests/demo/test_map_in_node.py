@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from mambaloc.images import read_image
 from mambaloc.runtime.maps import MapLocaliser, SparseMap
 from mambaloc.runtime.maps.absolute_pose import CameraPose, refine_pose
+from mambaloc.runtime.maps.drift import Drift, fit_drift
+from mambaloc.runtime.maps.lens import Lens
 from mambaloc.runtime.rotations import rotation_error_deg
 
 pytestmark = pytest.mark.slow
@@ -168,7 +171,40 @@ def test_refinement_is_pythons(solved):
         np.testing.assert_allclose(found["refined"]["covariance"], covariance, rtol=1e-3, atol=1e-9)
 
 
-def test_poses_in_a_map_are_pythons(den, map_of_den, modules, tmp_path):
+def adjusted(path, folder):
+    """The same map of a camera that is not quite a pinhole, whose given poses drifted by centimetres and degrees."""
+    sparse_map = SparseMap.load(path)
+    given, rng = sparse_map.key_poses.copy(), np.random.default_rng(2)
+    given[:, :3, 3] += 0.05 * np.sin(given[:, :3, 3] + rng.normal(size=3))
+    given[:, :3, :3] = Rotation.from_rotvec([0.0, 0.03, 0.01]).as_matrix() @ given[:, :3, :3]
+    drift = fit_drift(sparse_map.key_poses, given)
+    replace(sparse_map, lens=Lens(0.985, -0.04), drift=drift).save(folder / "adjusted.safetensors")
+    return folder / "adjusted.safetensors"
+
+
+def test_drift_is_pythons(map_of_den, tmp_path):
+    sparse_map = SparseMap.load(adjusted(map_of_den, tmp_path))
+    poses = sparse_map.key_poses[::5].copy()
+    poses[:, :3, 3] += 0.2
+    told = [
+        [{"rotation": pose[:3, :3].ravel().tolist(), "position_m": pose[:3, 3].tolist()} for pose in each]
+        for each in (sparse_map.key_poses, poses)
+    ]
+    asked = {"keyPoses": told[0], "weights": sparse_map.drift.tolist(), "poses": told[1]}
+    drift = Drift(sparse_map.key_poses, sparse_map.drift)
+    for matrix, found in zip(poses, json.loads(node(HERE / "drift.mjs", WEB, input=json.dumps(asked))), strict=True):
+        pose = CameraPose(matrix[:3, :3], matrix[:3, 3])
+        given, unsure = drift.to_given(pose)
+        assert np.linalg.norm(given.position_m - pose.position_m) > 0.01
+        for expected, own in ((given, found["given"]["pose"]), (drift.to_adjusted(pose), found["adjusted"])):
+            np.testing.assert_allclose(own["position_m"], expected.position_m, atol=1e-9)
+            np.testing.assert_allclose(np.reshape(own["rotation"], (3, 3)), expected.rotation, atol=1e-9)
+        np.testing.assert_allclose(found["given"]["unsure"], unsure, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("is_adjusted", [False, True], ids=["as_it_is", "adjusted"])
+def test_poses_in_a_map_are_pythons(den, map_of_den, is_adjusted, modules, tmp_path):
+    map_of_den = adjusted(map_of_den, tmp_path) if is_adjusted else map_of_den
     frames = sorted((den / "den/seq-02").glob("*.color.png"))
     large, black = tmp_path / "large.png", tmp_path / "black.png"
     cv2.imwrite(str(large), cv2.resize(cv2.imread(str(frames[0])), (640, 480), interpolation=cv2.INTER_CUBIC))

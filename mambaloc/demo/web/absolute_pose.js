@@ -7,7 +7,7 @@
  */
 
 import { posesOfThree } from "./three_points.js";
-import { cross, dot, solved, unit } from "./vectors.js";
+import { cross, dot, inverse, solved, unit } from "./vectors.js";
 
 const TRIALS = 1000;
 const CONFIDENCE = 0.9999;
@@ -116,13 +116,12 @@ export function refinePose(start, points, rays, near) {
     [pose, damping, now] = [changed, damping / 10, next];
     if (hasConverged) break;
   }
-  const identity = now.normal.map((row, i) => row.map((_, j) => Number(i === j)));
-  const covariance = solved(now.normal, identity)?.map((row) => row.map((value) => value * now.spread)) ?? null;
+  const covariance = inverse(now.normal)?.map((row) => row.map((value) => value * now.spread)) ?? null;
   return { pose, covariance };
 }
 
 /** Move a pose by metres, and turn it by radians about the world's axes. */
-function moved({ rotation, position_m }, [dx, dy, dz, ...turn]) {
+export function moved({ rotation, position_m }, [dx, dy, dz, ...turn]) {
   const angle = Math.hypot(...turn);
   const axis = unit(turn);
   const turned = [0, 1, 2].map((column) => {

@@ -1,12 +1,14 @@
 /** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localiser.py` finds it. No DOM. */
 
 import { project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
+import { Drift } from "./drift.js";
 import { matrixOf, median, quaternionOf } from "./geometry.js";
 import { matchAll, matchNearby } from "./matching.js";
 import { greyPicture } from "./pictures.js";
 import { detectFeatures } from "./sift.js";
 import { cameraOf } from "./sparse_map.js";
-import { largestEigenvalue, scaled } from "./vectors.js";
+import { largestEigenvalue } from "./vectors.js";
+import { spreadOf, squareBetween, viewpoint } from "./viewpoints.js";
 
 const AT_ONCE = 2500; // points, of those that most frames see, which are matched without a pose
 const RATIO = 0.85;
@@ -15,7 +17,8 @@ const NEAREST = 8; // key frames whose points are searched again
 const WINDOWS = [6, 2]; // radii of the guided rounds, in times of what is near
 const LEAST_SHARE = 0.1;
 const MOST_DEVIATION = 0.03; // of the key frames' spread
-const TURN = (25 * Math.PI) / 180; // radians that count as much as a move by the key frames' spread
+const LENS_STEPS = 10;
+const SAME = 0.01; // of the width, by which a camera may differ from the map's and still be its own
 
 /** Localises pictures in a map. */
 export class MapLocaliser {
@@ -24,6 +27,7 @@ export class MapLocaliser {
   #near; // in the plane at depth 1
   #unit_m;
   #viewpoints;
+  #drift;
 
   /**
    * @param map of `readMap`.
@@ -33,11 +37,9 @@ export class MapLocaliser {
     this.#map = map;
     this.#seed = seed;
     this.#near = (4.5 * map.width) / 160 / map.intrinsics.fx;
-    const count = map.key_poses.length / 16;
-    const poses = Array.from({ length: count }, (_, i) => map.key_poses.subarray(16 * i, 16 * i + 16));
-    const places = poses.map((pose) => [pose[3], pose[7], pose[11]]);
-    this.#unit_m = spreadOf(places);
-    this.#viewpoints = poses.map((pose, i) => this.#viewpoint(places[i], [pose[2], pose[6], pose[10]]));
+    this.#unit_m = spreadOf(map.keyPoses);
+    this.#viewpoints = map.keyPoses.map((pose) => viewpoint(pose, this.#unit_m));
+    this.#drift = map.drift.length ? new Drift(map.keyPoses, map.drift) : null;
   }
 
   /**
@@ -53,18 +55,20 @@ export class MapLocaliser {
     const camera = intrinsics ? cameraOf(intrinsics.flat()) : this.#cameraFor(image);
     if (!camera) return null;
     const grey = greyPicture(image, this.#map.intrinsics.fx / camera.fx);
-    const features = withRays(detectFeatures(grey), grey, rescaled(camera, image, grey));
+    const features = this.#withRays(detectFeatures(grey), grey, rescaled(camera, image, grey));
     const found = this.#search(features, prior && { ...prior, rotation: matrixOf(prior.quaternion_wxyz) });
     if (!found) return null;
     const { pose, covariance, keypoints, points, off } = found;
     const inliers = off.filter((each) => each <= this.#near).length;
     const deviation_m = covariance ? Math.sqrt(largestEigenvalue(covariance)) : Infinity;
+    const carried = this.#drift?.toGiven(pose);
+    const { position_m, rotation } = carried?.pose ?? pose;
     return {
-      position_m: pose.position_m,
-      quaternion_wxyz: quaternionOf(pose.rotation),
+      position_m,
+      quaternion_wxyz: quaternionOf(rotation),
       inliers,
       isAccepted: inliers >= this.#map.about.least_inliers && deviation_m <= MOST_DEVIATION * this.#unit_m,
-      covariance,
+      covariance: covariance?.map((row, i) => row.map((value, j) => value + (carried?.unsure[i][j] ?? 0))),
       matches: keypoints.map((row, i) => ({
         point: points[i],
         x: (features.pixels[2 * row] + 0.5) / grey.width,
@@ -79,7 +83,8 @@ export class MapLocaliser {
     const { points_m, descriptors } = this.#map;
     const near = this.#near;
     const first = matchAll(features, descriptors, Math.min(AT_ONCE, points_m.length / 3), RATIO);
-    let pose = ransacPose(...this.#matched(features, first), near, this.#seed) ?? prior;
+    let pose = ransacPose(...this.#matched(features, first), near, this.#seed);
+    if (!pose && prior) pose = this.#drift?.toAdjusted(prior) ?? prior;
     let [scale, found] = [near / 2, null]; // of the refinement; finer where the matches are
     for (const window of pose ? WINDOWS : []) {
       const projected = project(pose, points_m);
@@ -100,9 +105,9 @@ export class MapLocaliser {
   }
 
   /** Points in the picture that one of the nearest key frames sees: what is hidden from there is not searched. */
-  #visible({ corners: [left, top, right, bottom] }, { rotation, position_m }, projected) {
-    const here = this.#viewpoint(position_m, [rotation[2], rotation[5], rotation[8]]);
-    const apart = this.#viewpoints.map((there) => there.reduce((sum, value, i) => sum + (value - here[i]) ** 2, 0));
+  #visible({ corners: [left, top, right, bottom] }, pose, projected) {
+    const here = viewpoint(pose, this.#unit_m);
+    const apart = this.#viewpoints.map((there) => squareBetween(there, here));
     const nearest = [...apart.keys()].sort((a, b) => apart[a] - apart[b]).slice(0, NEAREST);
     const bytes = Math.ceil(this.#viewpoints.length / 8);
     const visible = [];
@@ -115,22 +120,25 @@ export class MapLocaliser {
     return visible;
   }
 
-  #viewpoint(position_m, forward) {
-    return [...scaled(position_m, 1 / Math.max(this.#unit_m, 1e-12)), ...scaled(forward, 1 / TURN)];
+  /** Add where keypoints, and the picture's upper left and lower right corner, lie in the plane at depth 1. */
+  #withRays(features, grey, camera) {
+    const { fx, fy, cx, cy } = camera;
+    const { lens, intrinsics, width, height } = this.#map;
+    const rays = features.pixels.map((value, i) => (i % 2 ? (value - cy) / fy : (value - cx) / fx));
+    const isSame = (a, b) => Math.abs(a - b) <= SAME * width;
+    const isOwn = isSame(grey.width, width) && isSame(grey.height, height);
+    if (isOwn && Object.keys(camera).every((name) => isSame(camera[name], intrinsics[name]))) straighten(rays, lens);
+    const end = { x: grey.width - 0.5, y: grey.height - 0.5 };
+    const corners = [(-0.5 - cx) / fx, (-0.5 - cy) / fy, (end.x - cx) / fx, (end.y - cy) / fy];
+    return { ...features, rays, corners };
   }
 
+  /** The map's camera for a picture of its shape; null for another. */
   #cameraFor(image) {
     const { width, height, intrinsics } = this.#map;
     if (Math.abs(image.width * height - image.height * width) > Math.max(width, height)) return null;
     return rescaled(intrinsics, this.#map, image);
   }
-}
-
-/** Root mean square of how far places are from their mean. */
-function spreadOf(places) {
-  const mean = [0, 1, 2].map((axis) => places.reduce((sum, place) => sum + place[axis], 0) / places.length);
-  const squares = places.map((place) => place.reduce((sum, value, axis) => sum + (value - mean[axis]) ** 2, 0));
-  return Math.sqrt(squares.reduce((a, b) => a + b, 0) / places.length);
 }
 
 /** A camera's intrinsics once a picture is resized; corners stay corners. */
@@ -139,9 +147,14 @@ function rescaled({ fx, fy, cx, cy }, from, to) {
   return { fx: x * fx, fy: y * fy, cx: x * cx + (x - 1) / 2, cy: y * cy + (y - 1) / 2 };
 }
 
-/** Add where keypoints, and the picture's upper left and lower right corner, lie in the plane at depth 1. */
-function withRays(features, { width, height }, { fx, fy, cx, cy }) {
-  const rays = features.pixels.map((value, i) => (i % 2 ? (value - cy) / fy : (value - cx) / fx));
-  const corners = [(-0.5 - cx) / fx, (-0.5 - cy) / fy, (width - 0.5 - cx) / fx, (height - 0.5 - cy) / fy];
-  return { ...features, rays, corners };
+/** Move rays to where a pinhole would see them, by fixed-point steps. */
+function straighten(rays, { focal, radial }) {
+  for (let i = 0; i < rays.length; i += 2) {
+    const [x, y] = [rays[i] / focal, rays[i + 1] / focal];
+    [rays[i], rays[i + 1]] = [x, y];
+    for (let step = 0; step < LENS_STEPS; step++) {
+      const stretch = 1 + radial * (rays[i] ** 2 + rays[i + 1] ** 2);
+      [rays[i], rays[i + 1]] = [x / stretch, y / stretch];
+    }
+  }
 }

@@ -8,7 +8,7 @@ const TYPES = { F32: Float32Array, F64: Float64Array, U8: Uint8Array, I64: BigIn
 /**
  * Read what `mambaloc/runtime/maps/sparse_map.py` wrote: safetensors, whose header says where each array lies.
  * @param {Uint8Array} bytes of the whole file.
- * @returns the arrays by their names there, row by row, descriptors as floats of unit length; and `about`.
+ * @returns what is there: `points_m` and `views` row by row, `descriptors` as floats of unit length.
  */
 export function readMap(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
@@ -28,7 +28,9 @@ export function readMap(bytes) {
     points_m: Float64Array.from(array("points_m")),
     descriptors: ofUnitLength(array("descriptors")),
     views: array("views"),
-    key_poses: array("key_poses"),
+    keyPoses: rowsOf(array("key_poses"), 16).map(poseOf),
+    drift: rowsOf(array("drift"), 6),
+    lens: lensOf(array("lens")),
     intrinsics: cameraOf(array("intrinsics")),
     width,
     height,
@@ -38,6 +40,22 @@ export function readMap(bytes) {
 /** Focal lengths and centre of a pinhole matrix of nine numbers. */
 export function cameraOf([fx, , cx, , fy, cy]) {
   return { fx, fy, cx, cy };
+}
+
+/** `world_from_cam` of a transform of 4x4. */
+function poseOf(m) {
+  return { rotation: [m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]], position_m: [m[3], m[7], m[11]] };
+}
+
+/** The true focal length over the claimed one, and the first coefficient of radial distortion. */
+function lensOf([focal, radial]) {
+  return { focal, radial };
+}
+
+function rowsOf(values, columns) {
+  return Array.from({ length: values.length / columns }, (_, i) =>
+    Array.from(values.subarray(i * columns, (i + 1) * columns)),
+  );
 }
 
 function ofUnitLength(bytes) {

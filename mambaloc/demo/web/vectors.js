@@ -1,4 +1,4 @@
-/** Vectors of three numbers, and linear equations. */
+/** Vectors of three numbers, and matrices as rows of numbers. */
 
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -30,6 +30,20 @@ export function solved(matrix, right) {
     }
   }
   return rows.map((row, i) => row.slice(size).map((value) => value / row[i]));
+}
+
+/** Null where there is none. */
+export function inverse(matrix) {
+  return solved(matrix, matrix.map((row, i) => row.map((_, j) => Number(i === j))));
+}
+
+export function product(a, b) {
+  const columns = transposed(b);
+  return a.map((row) => columns.map((column) => row.reduce((sum, value, i) => sum + value * column[i], 0)));
+}
+
+export function transposed(matrix) {
+  return matrix[0].map((_, column) => matrix.map((row) => row[column]));
 }
 
 /** The largest eigenvalue of a symmetric matrix of 3x3, from the roots of its characteristic polynomial. */
