@@ -1,9 +1,10 @@
 /** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localiser.py` finds it. No DOM. */
 
 import { project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
+import { LENGTH } from "./descriptors.js";
 import { Drift } from "./drift.js";
 import { matrixOf, median, quaternionOf } from "./geometry.js";
-import { matchAll, matchNearby } from "./matching.js";
+import { Matcher, matchNearby } from "./matching.js";
 import { greyPicture } from "./pictures.js";
 import { detectFeatures } from "./sift.js";
 import { cameraOf } from "./sparse_map.js";
@@ -28,6 +29,7 @@ export class MapLocaliser {
   #unit_m;
   #viewpoints;
   #drift;
+  #matcher;
 
   /**
    * @param map of `readMap`.
@@ -39,6 +41,7 @@ export class MapLocaliser {
     this.#near = (4.5 * map.width) / 160 / map.intrinsics.fx;
     this.#unit_m = spreadOf(map.keyPoses);
     this.#viewpoints = map.keyPoses.map((pose) => viewpoint(pose, this.#unit_m));
+    this.#matcher = new Matcher(map.descriptors.subarray(0, AT_ONCE * LENGTH));
     this.#drift = map.drift.length ? new Drift(map.keyPoses, map.drift) : null;
   }
 
@@ -82,7 +85,7 @@ export class MapLocaliser {
   #search(features, prior) {
     const { points_m, descriptors } = this.#map;
     const near = this.#near;
-    const first = matchAll(features, descriptors, Math.min(AT_ONCE, points_m.length / 3), RATIO);
+    const first = this.#matcher.match(features, RATIO);
     let pose = ransacPose(...this.#matched(features, first), near, this.#seed);
     if (!pose && prior) pose = this.#drift?.toAdjusted(prior) ?? prior;
     let [scale, found] = [near / 2, null]; // of the refinement; finer where the matches are
