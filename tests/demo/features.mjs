@@ -7,9 +7,9 @@ const [web, folder] = process.argv.slice(2);
 const { greyPicture } = await import(pathToFileURL(join(web, "pictures.js")));
 const { detectFeatures } = await import(pathToFileURL(join(web, "sift.js")));
 const cases = JSON.parse(await readFile(join(folder, "cases.json"), "utf8"));
-for (const [number, { width, height, channels, scale }] of cases.entries()) {
+for (const [number, { width, height, scale }] of cases.entries()) {
   const data = new Uint8Array(await readFile(join(folder, `${number}.rgb`)));
-  const grey = greyPicture({ data, width, height, channels }, scale);
+  const grey = greyPicture({ data, width, height }, scale);
   const { pixels, descriptors } = detectFeatures(grey);
   await writeFile(join(folder, `${number}.grey`), grey.values);
   await writeFile(join(folder, `${number}.pixels`), pixels);

@@ -12,6 +12,6 @@ const localiser = new MapLocaliser(readMap(new Uint8Array(await readFile(map))))
 const found = [];
 for (const picture of pictures) {
   const { data, width, height } = PNG.sync.read(await readFile(picture));
-  found.push(localiser.localise({ data, width, height, channels: 4 }));
+  found.push(localiser.localise({ data, width, height }));
 }
 console.log(JSON.stringify(found));

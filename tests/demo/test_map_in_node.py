@@ -50,9 +50,9 @@ def found(den, tmp_path_factory):
     folder, cases, expected = tmp_path_factory.mktemp("features"), [], []
     sift = cv2.SIFT.create(1000, contrastThreshold=0.02, enable_precise_upscale=True)
     for number, (picture, scale) in enumerate(pictures(den)):
-        height, width, channels = picture.shape
+        height, width = picture.shape[:2]
         (folder / f"{number}.rgb").write_bytes(picture.tobytes())
-        cases.append({"width": width, "height": height, "channels": channels, "scale": scale})
+        cases.append({"width": width, "height": height, "scale": scale})
         grey = cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)
         size = (round(width * min(scale, 1)), round(height * min(scale, 1)))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if size != (width, height) else grey

@@ -47,7 +47,7 @@ export class MapLocaliser {
 
   /**
    * Localise one picture.
-   * @param image as the network's localiser takes it, without distortion.
+   * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the map's camera unless given.
    * @param prior a pose to search around where all points at once find none.
    * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `covariance` as in Python, and

@@ -23,8 +23,8 @@ export class Matcher {
   /**
    * Match each keypoint that is clearly nearer to its best point than to its second best.
    *
-   * Most points are ruled out by the first numbers of the turned descriptors: what the others can add to a product is at
-   * most the product of their lengths. So this finds what all numbers would.
+   * Most points are ruled out by the first numbers of the turned descriptors: what the others can add to a product is
+   * at most the product of their lengths. So this finds what all numbers would.
    * @param {{count: number, descriptors: Float32Array}} features of the picture.
    * @param {number} ratio of both distances, below which a match counts.
    * @returns {{keypoints: number[], points: number[]}}

@@ -31,9 +31,11 @@ export class Preprocessor {
 
 /**
  * The grey picture, so many times as wide; larger it never gets.
- * @returns {{values: Uint8Array, width: number, height: number}}
+ * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number}} image RGB or RGBA.
+ * @returns {{values: Uint8ClampedArray, width: number, height: number}}
  */
-export function greyPicture({ data, width, height, channels }, scale) {
+export function greyPicture({ data, width, height }, scale) {
+  const channels = data.length / (width * height);
   const values = new Uint8ClampedArray(width * height);
   for (let from = 0, to = 0; to < values.length; from += channels, to++) {
     values[to] = (GREY[0] * data[from] + GREY[1] * data[from + 1] + GREY[2] * data[from + 2] + 2 ** 14) >> 15;

@@ -16,7 +16,7 @@ const FIT_STEPS = 5;
 
 /**
  * Find the keypoints of a grey picture.
- * @param {{values: Uint8Array|Float32Array, width: number, height: number}} grey in 0..255.
+ * @param {{values: ArrayLike<number>, width: number, height: number}} grey in 0..255.
  * @returns {{count: number, pixels: Float64Array, descriptors: Float32Array}} x, y of each keypoint, where the centre
  *   of the top left pixel is (0, 0), and 128 numbers of unit length.
  */
