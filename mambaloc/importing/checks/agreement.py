@@ -26,6 +26,7 @@ _CLEARLY = 0.1
 _SAME_FOCAL = 0.03
 _WORSE = 1.25
 _DRIFT = 0.5  # of what is possible
+_AS_GIVEN = int(np.abs(FOCALS - 1).argmin())
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,13 @@ class Agreement:
     def focal(self) -> float:
         """The focal length that most matches agree with, over that of the capture."""
         return best_focal(self.focal_share)
+
+    @property
+    def is_of_another_lens(self) -> bool:
+        """Whether another focal length than the given explains clearly more, and more than another order does."""
+        best, given = self.focal_share.max(), self.focal_share[_AS_GIVEN]
+        is_other = abs(self.focal - 1) > _SAME_FOCAL and best > max(given + _CLEARLY, _AGREE)
+        return bool(is_other) and not self.is_guessed and (self.order is None or best >= self.order.share)
 
 
 def agreement(capture: Capture, motion: Motion, with_adjusted: bool = False) -> Agreement:
@@ -132,19 +140,20 @@ def _contradiction(found: Agreement) -> str:
             f"the poses look like {best}: {found.share[best]:.0%} of matches agree with that, {share:.0%} with them "
             f"{AS_READ}; convert them, or name the format that says so with --format"
         )
-    if (order := found.order) is not None and order.share >= _AGREE:
+    order = found.order
+    if order is not None and order.share >= _AGREE and not found.is_of_another_lens:
         return (
             f"the pictures fit {order.name} better: {order.share:.0%} of matches agree, {order.as_read:.0%} as they "
             "were read; correct the time stamps, or the order of the files"
         )
-    if share < _AGREE and not found.is_guessed:
+    if share < _AGREE and not found.is_guessed and not found.is_of_another_lens:
         return (
             f"only {share:.0%} of matches between images agree with the poses: these may be inaccurate, or of other "
             "images, or the camera's intrinsics wrong; check that all three are of one recording"
         )
     far = found.bins[len(found.bins) // 2 :]
     agreeing, possible = (sum(each.matches * getattr(each, of) for each in far) for of in ("share", "possible"))
-    if not found.is_guessed and agreeing < _DRIFT * possible:
+    if not found.is_guessed and not found.is_of_another_lens and agreeing < _DRIFT * possible:
         total = sum(each.matches for each in far)
         return (
             f"the poses drift: {agreeing / total:.0%} of matches agree between images far apart, where "
@@ -154,7 +163,7 @@ def _contradiction(found: Agreement) -> str:
 
 
 def _check_focal(found: Agreement) -> Finding:
-    best, given = float(found.focal_share.max()), float(found.focal_share[np.abs(FOCALS - 1).argmin()])
+    best, given = float(found.focal_share.max()), float(found.focal_share[_AS_GIVEN])
     focal_px = found.focal * found.focal_px
     figures = {
         "given_px": round(found.focal_px, 2), "best_px": round(focal_px, 2), "best_over_given": round(found.focal, 4),
@@ -163,8 +172,7 @@ def _check_focal(found: Agreement) -> Finding:
     kind = "guessed" if found.is_guessed else "given"
     said = f"{found.focal_px:.0f} px {kind}, {given:.0%} of matches agree; most at {focal_px:.0f} px, {best:.0%}"
     concern = ""
-    is_other = abs(found.focal - 1) > _SAME_FOCAL and best > given + _CLEARLY
-    if is_other and not found.is_guessed and found.best == AS_READ and found.order is None:
+    if found.is_of_another_lens and found.best == AS_READ:
         concern = (
             f"the focal length looks like {focal_px:.0f} px rather than {found.focal_px:.0f}: {best:.0%} of matches "
             f"agree, not {given:.0%}; check that the intrinsics are of pictures of this size"

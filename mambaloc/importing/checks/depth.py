@@ -117,7 +117,7 @@ def sampled(depth: Depth, file: Path, rays: Floats) -> Floats:
     """
     steps = read_depth_mm(file)
     pixels = np.rint(rays @ depth.intrinsics[:2, :2].T + depth.intrinsics[:2, 2]).astype(int)
-    is_inside: NDArray[np.bool_] = ((pixels >= 0) & (pixels < steps.shape[::-1])).all(axis=1)
+    is_inside = np.all((pixels >= 0) & (pixels < steps.shape[::-1]), axis=1)
     x, y = np.where(is_inside[:, None], pixels, 0).T
     is_measured = is_inside & np.isin(steps[y, x], NO_DEPTH_MM, invert=True)
     return np.where(is_measured, depth.step * steps[y, x], np.nan)

@@ -42,7 +42,7 @@ class Matches:
 
     Shape:
         ``pairs`` (P, 2) rows of the capture; ``pair`` (M,) ascending; ``first`` and ``second`` (M, 2), where keypoints
-        lie in the plane at depth 1 of their cameras; ``focal_px`` (P,), were the longer side of the pictures 640 pixels.
+        lie in the plane at depth 1 of their cameras; ``focal_px`` (P,) in pictures whose longer side is 640 pixels.
 
     Args:
         pairs: neighbours in time come first.

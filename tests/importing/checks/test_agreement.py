@@ -110,7 +110,7 @@ def test_pictures_tell_in_which_convention_poses_are(written, convention):
 
 
 def test_pictures_of_other_poses_agree_with_none(written):
-    capture = replace(written, images=written.images[20:] + written.images[:20])
+    capture = replace(written, world_from_cam=np.roll(written.world_from_cam, 20, axis=0))
     assert "agree with the poses: these may be inaccurate" in checked(capture)[0].concern
 
 
@@ -121,7 +121,7 @@ def test_a_delay_is_found(written, shift, says):
     capture = replace(selected(written, rows.tolist()), world_from_cam=written.world_from_cam[rows - shift])
     found = better_order(capture, find_matches(capture, motion_of(capture)))
     assert found.name == says
-    assert found.share > 0.6 > found.as_read
+    assert found.share > 0.9 > found.as_read + 0.1
     assert f"the pictures fit {says} better" in checked(capture)[0].concern
 
 
