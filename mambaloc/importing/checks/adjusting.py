@@ -12,23 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.importing.capture import Capture
+from mambaloc.importing.capture import Capture, Depth
 from mambaloc.importing.checks.depth import sampled
-from mambaloc.importing.checks.matching import LONG_SIDE_PX, searched, shown
-from mambaloc.mapping.building import epipolar_px, keypoint_tracks
-from mambaloc.mapping.bundle_adjustment import Prior, adjust
+from mambaloc.importing.checks.matching import searched, shown
+from mambaloc.mapping.adjusting import moves
 from mambaloc.mapping.pairs import pairs_by_pose
-from mambaloc.mapping.tracks import match, sampson_distance
-from mambaloc.mapping.triangulation import Observations, triangulate
+from mambaloc.mapping.structure import recover_structure
+from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps.features import Features
 from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
 
-_MOST_FRAMES = 200  # the others move with their neighbours
-_ROUNDS = 2  # of triangulation and adjustment: better poses find more matches
-_PRIOR_DEG = 1.0
+_MOST_FRAMES = 100  # the others move with their neighbours
 _LEAST_POINTS = 50
 
 
@@ -64,69 +61,49 @@ def adjust_poses(capture: Capture) -> Adjusted:
     Raises:
         InputError: where its pictures give too few points.
     """
-    every = np.arange(len(capture.images))
-    rows = every[:: -(-len(every) // _MOST_FRAMES)]
-    given = np.linalg.inv(capture.world_from_cam[rows])
-    pairs = pairs_by_pose(capture.world_from_cam[rows])
+    every, stride = np.arange(len(capture.images)), -(-len(capture.images) // _MOST_FRAMES)
+    rows = every[::stride]
+    given = capture.world_from_cam[rows]
+    pairs = pairs_by_pose(given)
+    if not len(pairs):
+        raise InputError(
+            "--adjust-poses: no two frames look the same way from apart. Film while walking, or leave it out."
+        )
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         found = pool.map(lambda row: searched(capture, row), rows.tolist())
         features = list(shown(found, "Finding keypoints", len(rows)))
         of_pairs = pool.map(lambda pair: match(features[pair[0]], features[pair[1]]), pairs.tolist())
         matches = list(shown(of_pairs, "Matching pictures", len(pairs)))
-    poses = given
-    for _ in range(_ROUNDS):
-        seen, points = _points(features, poses, pairs, matches)
-        if len(points) < _LEAST_POINTS:
-            raise InputError(
-                f"--adjust-poses: the pictures give {len(points)} points. Film more texture, or leave it out."
-            )
-        depth = _depth(capture, rows, seen)
-        away = np.einsum("oj,oj->o", poses[seen.frame, 2, :3], points[seen.track]) + poses[seen.frame, 2, 3]
-        prior = Prior(given, np.radians(_PRIOR_DEG), np.radians(_PRIOR_DEG) * float(np.median(away)))
-        poses, points = adjust(poses, seen, points, prior, depth)
-    before, after = np.linalg.inv(given), np.linalg.inv(poses)
-    quaternion = (quaternion_from_matrix(each[:, :3, :3]) for each in (before, after))
+    depth = None
+    if capture.depth is not None:
+        depth = [_depth(capture.depth, row, each) for row, each in zip(rows.tolist(), features, strict=True)]
+    structure = recover_structure(features, given, pairs, matches, np.random.default_rng(0), depth)
+    if len(structure.points_m) < _LEAST_POINTS:
+        raise InputError(
+            f"--adjust-poses: the pictures give {len(structure.points_m)} points. Film more texture, or leave it out."
+        )
+    after = structure.world_from_cam
+    quaternion = (quaternion_from_matrix(each[:, :3, :3]) for each in (given, after))
     return Adjusted(
-        _carried(capture, rows, before, after),
+        _carried(capture, rows, after),
         len(rows),
-        len(points),
-        float(np.median(np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1))),
+        len(structure.points_m),
+        float(np.median(np.linalg.norm(after[:, :3, 3] - given[:, :3, 3], axis=1))),
         float(np.median(rotation_error_deg(*quaternion))),
-        _turns(poses) / _turns(given),
-        bool(np.isfinite(depth).any()),
+        _turns(after) / max(_turns(given), 1e-12),
+        depth is not None,
     )
 
 
-def _points(
-    features: list[Features], poses: Floats, pairs: Indices, matches: list[Indices]
-) -> tuple[Observations, Floats]:
-    """Triangulate the matches near their epipolar line, and keep the observations that agree."""
-    near, kept = epipolar_px(LONG_SIDE_PX), []
-    for (first, second), rows in zip(pairs.tolist(), matches, strict=True):
-        rays = features[first].rays[rows[:, 0]], features[second].rays[rows[:, 1]]
-        off = sampson_distance(poses[second] @ np.linalg.inv(poses[first]), *rays)
-        kept.append(rows[off * features[first].intrinsics[0, 0] <= near])
-    seen, _ = keypoint_tracks(features, pairs, kept, near)
-    points, is_point, agrees = triangulate(poses, seen, np.random.default_rng(0))
-    used = agrees & is_point[seen.track]
-    used &= np.bincount(seen.track[used], minlength=len(points))[seen.track] >= 2
-    return seen.select(used).renumbered(), points[np.unique(seen.track[used])]
+def _depth(depth: Depth, row: int, features: Features) -> Floats:
+    file = depth.files[row]
+    return np.full(len(features), np.nan) if file is None else sampled(depth, file, features.rays)
 
 
-def _depth(capture: Capture, rows: Indices, seen: Observations) -> Floats:
-    found = np.full(len(seen), np.nan)
-    for place, row in enumerate(rows.tolist()):
-        if capture.depth is not None and (file := capture.depth.files[row]) is not None:
-            found[seen.frame == place] = sampled(capture.depth, file, seen.rays[seen.frame == place])
-    return found
-
-
-def _carried(capture: Capture, rows: Indices, given: Floats, adjusted: Floats) -> Floats:
+def _carried(capture: Capture, rows: Indices, adjusted: Floats) -> Floats:
     """Move and turn every frame as the adjusted frames around it were, interpolated within its sequence."""
     found, names = capture.world_from_cam.copy(), np.array(capture.sequences)
-    moves = adjusted[:, :3, 3] - given[:, :3, 3]
-    turns = adjusted[:, :3, :3] @ given[:, :3, :3].swapaxes(1, 2)
-    changes = np.column_stack((moves, [cv2.Rodrigues(turn)[0][:, 0] for turn in turns]))
+    changes = moves(found[rows], adjusted)
     for name in dict.fromkeys(capture.sequences):
         every = np.flatnonzero(names == name)
         here = np.flatnonzero(names[rows] == name)
