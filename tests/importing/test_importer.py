@@ -176,10 +176,10 @@ def test_adjusted_poses_are_written_beside_the_given(rendered, tmp_path):
             frame["transform_matrix"] = pose.tolist()
 
     rendered.edit(disturb)
-    tool(rendered.folder, "--out", tmp_path / "room", "--adjust-poses")
+    tool(rendered.folder, "--out", tmp_path / "scene", "--adjust-poses")
     off = {}
     for name in ("frames.csv", "frames_adjusted.csv"):
-        with (tmp_path / "room" / name).open() as file:
+        with (tmp_path / "scene" / name).open() as file:
             rows = list(csv.DictReader(file))
         position = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
         turn = Rotation.from_quat([[float(row[axis]) for axis in ("qx", "qy", "qz", "qw")] for row in rows])
@@ -189,10 +189,10 @@ def test_adjusted_poses_are_written_beside_the_given(rendered, tmp_path):
     given, adjusted = off.values()
     assert adjusted[0] < 0.8 * given[0]
     assert adjusted[1] < 0.6 * given[1]
-    said = told(tmp_path / "room")["sanity"]["checks"]
+    said = told(tmp_path / "scene")["sanity"]["checks"]
     assert all(each["adjusted"] > each["share"] for each in said["images and poses"]["by_baseline"][:2])
     assert 0 < said["adjusted poses"]["moved"] < 0.03
-    report = (tmp_path / "room/report.md").read_text()
+    report = (tmp_path / "scene/report.md").read_text()
     assert "nothing uses unless it is renamed" in report
     assert "pictures alone prefer turns that are too small" in report
 

@@ -169,13 +169,13 @@ def test_the_share_by_baseline(written, matches):
     assert [each.low for each in exact[1:]] == [each.high for each in exact[:-1]]
     assert sum(each.matches for each in exact) <= len(matches.pair)
     assert all(each.share > 0.85 * each.possible for each in exact)
-    drifting, yaw = written.world_from_cam.copy(), np.linspace(0, 8, 40)[:, None]
-    drifting[:, :3, :3] = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ drifting[:, :3, :3]
+    drifting = written.world_from_cam.copy()
+    tilt = np.sin(np.linspace(0, 6, 40))[:, None]  # a drift about the upright axis would look like another lens
+    drifting[:, :3, :3] = Rotation.from_euler("x", tilt, degrees=True).as_matrix() @ drifting[:, :3, :3]
     bins = by_baseline(matches, drifting, written.world_from_cam)
     assert bins[-1].share < 0.6 * bins[-1].possible
     assert [each.adjusted for each in bins] == pytest.approx([each.share for each in exact])
-    far = replace(written, world_from_cam=drifting)
-    assert "--adjust-poses" in checked(far)[0].concern or "agree with the poses" in checked(far)[0].concern
+    assert "--adjust-poses writes poses" in checked(replace(written, world_from_cam=drifting))[0].concern
 
 
 # --- the focal length ------------------------------------------------------------------------------------------------
