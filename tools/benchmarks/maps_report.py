@@ -12,7 +12,7 @@ import numpy as np
 from maps_robustness import FAR_DEG, FAR_M, Answers, compare, save_answers, wilson_interval
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from mambaloc import provenance
 from mambaloc.errors import InputError
@@ -155,14 +155,14 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
     Raises:
         InputError: where the picture cannot be written.
     """
-    figure = Figure(figsize=(2.1 + 2.5 * len(results), 6.2), layout="constrained")
+    figure = Figure(figsize=(2.2 + 2.5 * len(results), 6.8), layout="constrained")
     grid = figure.subplots(2, len(results), squeeze=False, sharey=True)
     for (above, below), result in zip(grid.T, results, strict=True):
         _draw_medians(above, result)
         _draw_tails(below, result)
-        above.set_title(result["label"], fontsize=9)
+        above.set_title(result["label"].replace(", ", "\n"), fontsize=10)
     handles, names = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper left", ncols=3, frameon=False, fontsize=9)
+    figure.legend(handles, names, loc="outside upper center", ncols=3, frameon=False, fontsize=11)
     with writing(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(figure, path)
@@ -171,19 +171,20 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
 def _draw_medians(axes: Axes, result: Mapping[str, Any]) -> None:
     values = _values(result, "position_error_m")
     finite = [each for of in values.values() for each in of if np.isfinite(each)]
-    low, high = min(finite) / 1.5, max(finite) * 1.5
-    axes.set(xscale="log", xlim=(low, high * 1.8), xlabel=f"median position error [{result['unit']}]")
+    low, lost = min(finite) / 1.5, max(finite) * 1.6
+    axes.set(xscale="log", xlim=(low, lost * 1.5), xlabel=f"median position error [{result['unit']}]")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if lost < 50 * low else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    _draw_marks(axes, {way: [min(each, high * 1.5) for each in of] for way, of in values.items()}, result)
-    for row, each in enumerate(values.get("map", [])):
+    axes.xaxis.set_minor_locator(NullLocator())
+    _draw_marks(axes, {way: [min(each, lost) for each in of] for way, of in values.items()}, result)
+    for row, each in enumerate(values["map"]):
         if not np.isfinite(each):
-            axes.annotate("no pose", (high * 1.5, row), (-7, 0), textcoords="offset points", fontsize=7, ha="right",
+            axes.annotate("no pose", (lost, row), (-7, 0), textcoords="offset points", fontsize=9, ha="right",
                           va="center", color=_WAYS["map"][0])  # fmt: skip
 
 
 def _draw_tails(axes: Axes, result: Mapping[str, Any]) -> None:
-    axes.set(xlim=(-4, 104), xlabel=f"frames off by over {FAR_M} {result['unit']} or {FAR_DEG:.0f}° [%]")
+    axes.set(xlim=(-4, 104), xlabel=f"over {FAR_M} {result['unit']} or {FAR_DEG:.0f}° off [% of frames]")
     _draw_marks(axes, {way: [100 * each for each in of] for way, of in _values(result, "wrong").items()}, result)
 
 
@@ -191,12 +192,10 @@ def _draw_marks(axes: Axes, values: Mapping[str, Sequence[float]], result: Mappi
     rows = np.arange(len(result["disturbances"]))
     for way, of in values.items():
         color, mark = _WAYS[way]
-        size, width = (13, 2.4) if way == "both" else (6, 1)
+        size, width = (14, 2.6) if way == "both" else (7, 1)
         axes.plot(of, rows, linestyle="", color=color, marker=mark, ms=size, mew=width, label=way)
-    axes.set_yticks(rows, list(result["disturbances"]), fontsize=8)
+    axes.set_yticks(rows, list(result["disturbances"]))
     axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.tick_params(axis="x", labelsize=8)
-    axes.xaxis.label.set_fontsize(8)
     finish(axes)
 
 

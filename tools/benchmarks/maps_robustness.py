@@ -17,6 +17,7 @@ from rich.progress import track
 from mambaloc.images import read_image
 from mambaloc.mapping.building import PosedFrames
 from mambaloc.runtime import Localiser
+from mambaloc.runtime.localisation import combined
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
 from mambaloc.runtime.maps.features import rescaled_intrinsics
 from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_error_deg
@@ -130,8 +131,7 @@ def _localise(
         found.setdefault("map", []).append((alone, alone.is_accepted, alone_s))
         if guess:
             guided, guided_s = _timed(localiser.localise, picture, intrinsics, prior)
-            pose = guided if guided.is_accepted else guess
-            found.setdefault("both", []).append((pose, guided.is_accepted, network_s + guided_s))
+            found.setdefault("both", []).append((combined(guess, guided), guided.is_accepted, network_s + guided_s))
     return found
 
 

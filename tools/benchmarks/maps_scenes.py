@@ -110,4 +110,4 @@ def _network(path: Path, onnx: Path) -> tuple[Localiser, dict[str, Any]]:
         "bytes": onnx.stat().st_size,
         "training": checkpoint.describe(),
     }
-    return Localiser(onnx, threads=1), about
+    return Localiser(onnx, threads=1, sparse_map=False), about
