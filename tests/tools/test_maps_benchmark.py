@@ -3,18 +3,21 @@
 import json
 
 import cv2
+import maps_robustness
 import numpy as np
 import pytest
-from maps_colmap import ColmapRoute, write_pictures
+from maps_colmap import ColmapRoute, Pictures
 from maps_disturbances import DISTURBANCES, exposure, motion_blur, occlusion, smaller
 from maps_report import summarise, table, write_result
 from maps_robustness import Answers, compare, measure, wilson_interval
+from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
 from mambaloc.evaluation.intervals import block_resamples
 from mambaloc.mapping import PosedFrames
 from mambaloc.mapping.building import MapSettings, build_map
 from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render
+from mambaloc.runtime import Localisation
 
 SIZE = (160, 120)
 
@@ -175,39 +178,66 @@ def room():
     return frames.select(np.flatnonzero(~is_query)), frames.select(np.flatnonzero(is_query))
 
 
-def test_a_map_is_measured_under_every_disturbance(room):
+class Stuck:
+    """A network that always answers the first query's place."""
+
+    def __init__(self, world_from_cam):
+        quaternion = Rotation.from_matrix(world_from_cam[:3, :3]).as_quat()[[3, 0, 1, 2]]
+        self.answer = Localisation(world_from_cam[:3, 3], quaternion, 0.0)
+
+    def localise(self, image):
+        return self.answer
+
+
+def test_network_map_and_both_under_every_disturbance(room):
     key, queries = room
     sparse_map = build_map(key, MapSettings(key_frames=24, width=160), "room")
-    found = measure(sparse_map, None, queries, [0, 1])
+    found = measure(sparse_map, Stuck(queries.world_from_cam[0]), queries, [0, 1])
     assert list(found) == list(DISTURBANCES)
+    moved_m = np.linalg.norm(queries.world_from_cam[:, :3, 3] - queries.world_from_cam[0, :3, 3], axis=1)
     for ways in found.values():
-        assert list(ways) == ["map"]
-        assert ways["map"].position_m.shape == (2, 4)
-    assert np.median(found["undisturbed"]["map"].position_m) < 0.05
-    assert found["undisturbed"]["map"].is_accepted.any()
+        assert list(ways) == ["network", "map", "both"]
+        assert ways["both"].position_m.shape == (2, 4)
+        np.testing.assert_allclose(ways["network"].position_m, moved_m[None], atol=1e-9)
+        answered = np.broadcast_to(moved_m, (2, 4))[~ways["both"].is_accepted]
+        np.testing.assert_allclose(ways["both"].position_m[~ways["both"].is_accepted], answered, atol=1e-9)
+    seen = found["undisturbed"]
+    assert seen["map"].is_accepted.any()
+    np.testing.assert_array_equal(
+        seen["both"].position_m[seen["map"].is_accepted], seen["map"].position_m[seen["map"].is_accepted]
+    )
+    assert np.median(seen["map"].position_m) < 0.05
     assert not found["exposure x 0.1"]["map"].is_accepted.all()
+
+
+def test_a_map_alone_is_measured(room):
+    key, queries = room
+    sparse_map = build_map(key, MapSettings(key_frames=24, width=160), "room")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(maps_robustness, "DISTURBANCES", {"undisturbed": DISTURBANCES["undisturbed"]})
+        found = measure(sparse_map, None, queries, [0])
+    assert list(found["undisturbed"]) == ["map"]
     assert "| undisturbed | map |" in table(summarise(found, ["walk"] * 4, {"label": "room"}))
 
 
 def test_colmap_localises_in_the_same_room(room, tmp_path):
     """Its pose within 5 cm shows that pixels, cameras and poses are handed over in COLMAP's conventions."""
     key, queries = room
-    names, intrinsics = write_pictures(key, SIZE[0], tmp_path / "key")
-    asked, _ = write_pictures(queries, SIZE[0], tmp_path / "query")
+    shown, asked = (Pictures.write(each, SIZE[0], tmp_path / name) for each, name in ((key, "key"), (queries, "query")))
     (tmp_path / "work").mkdir()
-    route = ColmapRoute(tmp_path / "work", intrinsics, SIZE)
-    route.build(tmp_path / "key", names, key.world_from_cam)
-    poses = route.localise(tmp_path / "query", asked)
+    route = ColmapRoute(shown, tmp_path / "work")
+    route.build()
+    poses = route.localise(asked)
     off_m = [
         np.inf if pose is None else np.linalg.norm(pose[:3, 3] - truth[:3, 3])
         for pose, truth in zip(poses, queries.world_from_cam, strict=True)
     ]
     assert np.median(off_m) < 0.05
-    assert cv2.imread(str(tmp_path / "query" / asked[0])).shape == (SIZE[1], SIZE[0], 3)
+    assert cv2.imread(str(tmp_path / "query" / asked.names[0])).shape == (SIZE[1], SIZE[0], 3)
     assert route.bytes() > 100_000
 
 
-def test_figure_of_several_scenes_from_a_shell(tmp_path, tool, capsys):
+def test_report_of_several_scenes_from_a_shell(tmp_path, tool, capsys):
     rng = np.random.default_rng(0)
     for name in ("one", "two"):
         found = {
@@ -218,12 +248,20 @@ def test_figure_of_several_scenes_from_a_shell(tmp_path, tool, capsys):
             }
             for each in DISTURBANCES
         }
-        write_result(summarise(found, ["a"] * 40, {"label": name, "unit": "m"}), found, tmp_path / name)
+        about = {"label": name, "unit": "m"}
+        about["network"] = {"bytes": 10 * 2**20, "preparation_cpu_s": 100.0 if name == "one" else None}
+        about["map"] = {"bytes": 2**20, "preparation_cpu_s": 2.5}
+        write_result(summarise(found, ["a"] * 40, about), found, tmp_path / name)
     read = json.loads((tmp_path / "one/robustness.json").read_text())
     assert read["disturbances"]["undisturbed"]["ways"]["map"]["position_error_m"] is None  # JSON has no infinity
     assert np.load(tmp_path / "one/answers.npz")["undisturbed/both/position_m"].shape == (1, 40)
-    tool("benchmarks/maps", "figure", tmp_path / "one", tmp_path / "two", "--out", tmp_path / "figure.png")
+    tool("benchmarks/maps", "report", tmp_path / "one", tmp_path / "two", "--out", tmp_path / "figure.png")
+    said = capsys.readouterr().out
+    assert "| 10 ms | 11.00 MiB | 102 core-s |" in said  # both of one
+    assert "| 10 ms | 11.00 MiB |  |" in said
+    assert said.count("| exposure x 0.1 |") == 2
+    assert "no pose; " in said
     assert cv2.imread(str(tmp_path / "figure.png")).shape[1] > 600
     with pytest.raises(SystemExit):
-        tool("benchmarks/maps", "figure", tmp_path / "none", "--out", tmp_path / "figure.png")
+        tool("benchmarks/maps", "report", tmp_path / "none", "--out", tmp_path / "figure.png")
     assert "measure it with maps.py robustness" in capsys.readouterr().err

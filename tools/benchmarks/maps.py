@@ -2,7 +2,7 @@
 
 python tools/benchmarks/maps.py robustness RECIPE|SCENE [--checkpoint CHECKPOINT] [--frames N] [--width PX]
 python tools/benchmarks/maps.py colmap RECIPE|SCENE [--frames N] [--width PX]
-python tools/benchmarks/maps.py figure FOLDER ... --out PICTURE
+python tools/benchmarks/maps.py report FOLDER ... --out PICTURE
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from maps_report import draw, read_results
+from maps_report import by_disturbance, draw, overview, read_results
 
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.mapping.recipe import MapRecipe, read_recipe
@@ -23,7 +23,7 @@ def main() -> None:
     quieten()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    robustness, colmap, figure = (commands.add_parser(name) for name in ("robustness", "colmap", "figure"))
+    robustness, colmap, report = (commands.add_parser(name) for name in ("robustness", "colmap", "report"))
     for command in (robustness, colmap):
         command.add_argument("source", type=Path, metavar="RECIPE|SCENE", help="as tools/map.py takes it")
         command.add_argument("--frames", type=int, help="key frames; the recipe's unless given")
@@ -34,13 +34,15 @@ def main() -> None:
         )
         command.add_argument("--out", type=Path, help="folder to write to")
     robustness.add_argument("--checkpoint", type=Path, help="of a network trained on the same scene")
+    robustness.add_argument("--training-cpu-s", type=float, help="CPU seconds that its training took, for the tables")
     robustness.add_argument("--unit", default="m", help="of the scene's positions, for the figure")
-    figure.add_argument("folders", nargs="+", type=Path, help="that robustness wrote")
-    figure.add_argument("--out", type=Path, required=True, help="the PNG")
+    report.add_argument("folders", nargs="+", type=Path, help="that robustness wrote")
+    report.add_argument("--out", type=Path, required=True, help="picture to draw, a PNG")
     args = parser.parse_args()
-    if args.command == "figure":
-        draw(read_results(args.folders), args.out)
-        print(args.out)
+    if args.command == "report":
+        results = read_results(args.folders)
+        draw(results, args.out)
+        print(overview(results), *map(by_disturbance, results), sep="\n")
         return
     recipe = MapRecipe(str(args.source)) if args.source.is_dir() else read_recipe(args.source)
     given = {"key_frames": args.frames, "width": args.width}
@@ -50,7 +52,7 @@ def main() -> None:
     if args.command == "robustness":
         from maps_scenes import measure_robustness
 
-        print(measure_robustness(recipe, args.checkpoint, args.hold_out, args.unit, out))
+        print(measure_robustness(recipe, args.checkpoint, args.training_cpu_s, args.hold_out, args.unit, out))
     else:
         from maps_beside import measure_beside_colmap
 

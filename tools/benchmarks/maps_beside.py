@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from maps_colmap import ColmapRoute, write_pictures
+from maps_colmap import ColmapRoute, Pictures
 from maps_robustness import Answers, score
 from maps_scenes import key_and_query, timed_map
 from numpy.typing import NDArray
@@ -22,13 +22,12 @@ from mambaloc.benchmark.footprint import in_a_process
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
 from mambaloc.images import read_image
-from mambaloc.mapping.building import PosedFrames
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
-Floats = NDArray[np.floating[Any]]
+Floats = NDArray[np.float64]
 Scores = list[tuple[float, float, bool, float]]
 
 
@@ -70,13 +69,16 @@ def measure_beside_colmap(recipe: MapRecipe, hold_out: str | None, out: Path) ->
     turns: dict[str, list[Turn]] = {"ours": [], "pycolmap": []}
     with TemporaryDirectory() as folder, writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        shown = [_small(frames, recipe, Path(folder, name)) for name, frames in (("key", key), ("query", queries))]
+        shown_key, shown_queries = (
+            Pictures.write(frames, recipe.settings.width, Path(folder, name))
+            for name, frames in (("key", key), ("query", queries))
+        )
         for seed in recipe.ransac_seeds:
-            turns["ours"].append(_ours(*shown, recipe, seed, out))
+            turns["ours"].append(_ours(shown_key, shown_queries, recipe, seed, out))
             work = Path(folder, f"colmap{seed}")
             work.mkdir()
             try:
-                turns["pycolmap"].append(in_a_process(_theirs, *shown, work, seed))
+                turns["pycolmap"].append(in_a_process(_theirs, shown_key, shown_queries, work, seed))
             except BrokenProcessPool:
                 raise InputError(f"{recipe.scene}: pycolmap crashed. Try fewer frames, or another version.") from None
     result = {
@@ -96,46 +98,30 @@ def measure_beside_colmap(recipe: MapRecipe, hold_out: str | None, out: Path) ->
     return text
 
 
-def _small(frames: PosedFrames, recipe: MapRecipe, folder: Path) -> PosedFrames:
-    """The same frames as files of the size in which keypoints are searched."""
-    names, intrinsics = write_pictures(frames, recipe.settings.width, folder)
-    return PosedFrames(
-        [folder / name for name in names], np.repeat(intrinsics[None], len(names), 0), frames.world_from_cam
-    )
-
-
-def _ours(key: PosedFrames, queries: PosedFrames, recipe: MapRecipe, seed: int, out: Path) -> Turn:
+def _ours(key: Pictures, queries: Pictures, recipe: MapRecipe, seed: int, out: Path) -> Turn:
     settings = replace(recipe.settings, key_frames=len(key))
-    sparse_map, build_cpu_s = timed_map(key, replace(recipe, settings=settings))
+    sparse_map, build_cpu_s = timed_map(key.frames, replace(recipe, settings=settings))
     sparse_map.save(out / MAP_FILE)
     localiser, scores = MapLocaliser(sparse_map, seed), []
-    for image, intrinsics, truth in zip(queries.images, queries.intrinsics, queries.world_from_cam, strict=True):
+    for name, truth in zip(queries.names, queries.world_from_cam, strict=True):
         start = time.process_time()
-        found = localiser.localise(read_image(Path(image)), intrinsics)  # theirs reads the file, too
+        found = localiser.localise(read_image(queries.folder / name), queries.intrinsics)  # theirs reads the file, too
         scores.append(score(found, found.is_accepted, time.process_time() - start, truth))
     return Turn(scores, build_cpu_s, (out / MAP_FILE).stat().st_size, len(sparse_map))
 
 
-def _theirs(key: PosedFrames, queries: PosedFrames, work: Path, seed: int) -> Turn:
+def _theirs(key: Pictures, queries: Pictures, work: Path, seed: int) -> Turn:
     """In a process of its own, which a crash ends."""
-    height, width = read_image(Path(key.images[0])).shape[:2]
-    route = ColmapRoute(work, key.intrinsics[0], (width, height), seed)
-    folder, names = _named(key)
-    start = time.process_time()
-    route.build(folder, names, key.world_from_cam)
+    route, start = ColmapRoute(key, work, seed), time.process_time()
+    route.build()
     build_cpu_s, start = time.process_time() - start, time.process_time()
-    poses = route.localise(*_named(queries))
+    poses = route.localise(queries)
     each_s = (time.process_time() - start) / len(queries)
     scores = [_score(pose, each_s, truth) for pose, truth in zip(poses, queries.world_from_cam, strict=True)]
     return Turn(scores, build_cpu_s, route.bytes(), int(route.model.num_points3D()))
 
 
-def _named(frames: PosedFrames) -> tuple[Path, list[str]]:
-    paths = [Path(image) for image in frames.images]
-    return paths[0].parent, [path.name for path in paths]
-
-
-def _score(pose: Floats | None, cpu_s: float, truth: Floats) -> tuple[float, float, bool, float]:
+def _score(pose: NDArray[Any] | None, cpu_s: float, truth: Floats) -> tuple[float, float, bool, float]:
     if pose is None:
         return np.inf, np.inf, False, cpu_s
     return score(_Found(pose[:3, 3], quaternion_from_matrix(pose[:3, :3])), False, cpu_s, truth)
@@ -143,8 +129,8 @@ def _score(pose: Floats | None, cpu_s: float, truth: Floats) -> tuple[float, flo
 
 @dataclass(frozen=True)
 class _Found:
-    position_m: Floats
-    quaternion: Floats
+    position_m: NDArray[Any]
+    quaternion: NDArray[Any]
 
 
 def _summary(turns: Sequence[Turn]) -> dict[str, Any]:

@@ -28,16 +28,40 @@ _RETRIEVED = 10  # key frames
 _WORDS = 32  # of the codebook
 
 
-def write_pictures(frames: PosedFrames, width: int, folder: Path) -> tuple[list[str], Floats]:
-    """Write frames as PNG of a width; their names, and the matrix (3, 3) of their one camera at that size."""
-    folder.mkdir(parents=True)
-    names = [f"{folder.name}_{number:05d}.png" for number in range(len(frames))]
-    for name, image in zip(names, frames.images, strict=True):
-        rgb = read_image(image) if isinstance(image, Path) else image
-        height = round(rgb.shape[0] * width / rgb.shape[1])
-        small = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
-        cv2.imwrite(str(folder / name), small[..., ::-1])
-    return names, rescaled_intrinsics(frames.intrinsics[0], (rgb.shape[1], rgb.shape[0]), (width, height))
+@dataclass(frozen=True)
+class Pictures:
+    """Frames of one camera as files of one size.
+
+    Shape:
+        ``intrinsics`` (3, 3), where the centre of the top-left pixel is (0, 0); ``world_from_cam`` (N, 4, 4).
+    """
+
+    folder: Path
+    names: list[str]
+    size: tuple[int, int]
+    intrinsics: NDArray[np.float64]
+    world_from_cam: NDArray[np.float64]
+
+    @classmethod
+    def write(cls, frames: PosedFrames, width: int, folder: Path) -> Pictures:
+        """Write frames as PNG of a width."""
+        folder.mkdir(parents=True)
+        names = [f"{folder.name}_{number:05d}.png" for number in range(len(frames))]
+        for name, image in zip(names, frames.images, strict=True):
+            rgb = read_image(image) if isinstance(image, Path) else image
+            size = (width, round(rgb.shape[0] * width / rgb.shape[1]))
+            cv2.imwrite(str(folder / name), cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)[..., ::-1])
+        intrinsics = rescaled_intrinsics(frames.intrinsics[0], (rgb.shape[1], rgb.shape[0]), size)
+        return cls(folder, names, size, intrinsics, frames.world_from_cam)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def frames(self) -> PosedFrames:
+        """The same as frames that a map is built from."""
+        paths = [self.folder / name for name in self.names]
+        return PosedFrames(paths, np.repeat(self.intrinsics[None], len(self), axis=0), self.world_from_cam)
 
 
 @dataclass
@@ -45,15 +69,13 @@ class ColmapRoute:
     """A model of key frames, and queries localised in it.
 
     Args:
+        key: the key frames.
         work: an empty folder for the database and the model.
-        intrinsics: (3, 3) matrix of the one camera of all pictures, the centre of the top-left pixel at (0, 0).
-        size: (width, height) of the pictures.
         seed: of every RANSAC.
     """
 
+    key: Pictures
     work: Path
-    intrinsics: Floats
-    size: tuple[int, int]
     seed: int = 0
 
     @cached_property
@@ -71,13 +93,13 @@ class ColmapRoute:
 
     def camera(self, number: int) -> Any:
         """The camera in COLMAP's pixels, which count from the corner."""
-        focal_x, focal_y = np.diag(self.intrinsics)[:2]
-        centre = self.intrinsics[:2, 2] + CORNER_PX
-        width, height = self.size
+        focal_x, focal_y = np.diag(self.key.intrinsics)[:2]
+        centre = self.key.intrinsics[:2, 2] + CORNER_PX
+        width, height = self.key.size
         params = (focal_x, focal_y, *centre)
         return self.colmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
 
-    def find_features(self, folder: Path, names: Sequence[str]) -> None:
+    def find_features(self, pictures: Pictures) -> None:
         """Find SIFT of pictures, with COLMAP's defaults, on one thread."""
         colmap, mode = self.colmap, self.colmap.CameraMode.SINGLE
         reader = colmap.ImageReaderOptions(camera_model="PINHOLE")
@@ -85,7 +107,7 @@ class ColmapRoute:
         with colmap.Database.open(self.database):  # which makes it
             pass
         options = colmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
-        colmap.extract_features(self.database, folder, names, mode, reader, options)
+        colmap.extract_features(self.database, pictures.folder, pictures.names, mode, reader, options)
 
     def match(self, pairs: Sequence[tuple[str, str]], is_verified: bool) -> None:
         """Match pairs of pictures."""
@@ -98,26 +120,25 @@ class ColmapRoute:
         pairing = self.colmap.ImportedPairingOptions(match_list_path=listed)
         self.colmap.match_image_pairs(self.database, matching, pairing, verification)
 
-    def build(self, folder: Path, names: Sequence[str], world_from_cam: Floats) -> None:
+    def build(self) -> None:
         """Triangulate key frames with their given poses, and make the index that finds them."""
-        self.find_features(folder, names)
-        self.match([(names[a], names[b]) for a, b in pairs_by_pose(world_from_cam)], is_verified=True)
-        colmap = self.colmap
+        colmap, key = self.colmap, self.key
+        self.find_features(key)
+        self.match([(key.names[a], key.names[b]) for a, b in pairs_by_pose(key.world_from_cam)], is_verified=True)
         with colmap.Database.open(self.database) as database:
-            images = [database.read_image_with_name(name) for name in names]
+            images = [database.read_image_with_name(name) for name in key.names]
             descriptors = [database.read_descriptors(image.image_id).data for image in images]
         model = colmap.Reconstruction()
         model.add_camera_with_trivial_rig(self.camera(images[0].camera_id))
-        for image, pose in zip(images, np.linalg.inv(world_from_cam), strict=True):
+        for image, pose in zip(images, np.linalg.inv(key.world_from_cam), strict=True):
             fresh = colmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
             model.add_image_with_trivial_frame(fresh, colmap.Rigid3d(pose[:3]))
         options = colmap.IncrementalPipelineOptions(num_threads=1, random_seed=self.seed, extract_colors=False)
         (self.work / "model").mkdir()
         self.model = colmap.triangulate_points(
-            model, self.database, folder, self.work / "model", True, options, refine_intrinsics=False
+            model, self.database, key.folder, self.work / "model", True, options, refine_intrinsics=False
         )
         self.key_ids = [image.image_id for image in images]
-        self.key_names = list(names)
         self.words = _codebook(np.concatenate(descriptors), self.seed)
         self.index = np.stack([_vlad(each, self.words) for each in descriptors])
         self.points = {  # of each key frame's keypoints, and which have one
@@ -132,15 +153,15 @@ class ColmapRoute:
         model = sum(path.stat().st_size for path in (self.work / "model").iterdir())
         return model + descriptors + 2 * (self.words.size + self.index.size)
 
-    def localise(self, folder: Path, names: Sequence[str]) -> list[Floats | None]:
+    def localise(self, queries: Pictures) -> list[Floats | None]:
         """Localise queries, all of each step together: ``world_from_cam`` (4, 4), or None, of each."""
-        self.find_features(folder, names)
+        self.find_features(queries)
         with self.colmap.Database.open(self.database) as database:
-            numbers = [database.read_image_with_name(name).image_id for name in names]
+            numbers = [database.read_image_with_name(name).image_id for name in queries.names]
             vlads = np.stack([_vlad(database.read_descriptors(number).data, self.words) for number in numbers])
             nearest = np.argsort(-vlads @ self.index.T, axis=1, kind="stable")[:, :_RETRIEVED]
         self.match(
-            [(name, self.key_names[row]) for name, rows in zip(names, nearest, strict=True) for row in rows],
+            [(name, self.key.names[row]) for name, rows in zip(queries.names, nearest, strict=True) for row in rows],
             is_verified=False,
         )
         with self.colmap.Database.open(self.database) as database:
@@ -164,7 +185,7 @@ class ColmapRoute:
         rows, points = zip(*sorted(seen), strict=True)
         options = self.colmap.AbsolutePoseEstimationOptions()
         options.ransac.random_seed = self.seed
-        options.ransac.max_error = 4.5 * self.size[0] / 160  # as ours: given poses drift by that much
+        options.ransac.max_error = 4.5 * self.key.size[0] / 160  # as ours: given poses drift by that much
         found = self.colmap.estimate_and_refine_absolute_pose(
             pixels[list(rows)], np.array([self.model.point3D(p).xyz for p in points]), self.camera(1), options
         )
@@ -189,4 +210,4 @@ def _vlad(descriptors: NDArray[np.uint8], words: Floats) -> Floats:
     sums = np.zeros_like(words)
     np.add.at(sums, nearest, data - words[nearest])
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
-    return np.asarray((sums / max(np.linalg.norm(sums), 1e-9)).ravel())
+    return np.asarray((sums / np.maximum(np.linalg.norm(sums), 1e-9)).ravel())

@@ -114,8 +114,11 @@ def _cells(of: Mapping[str, Any], way: str) -> tuple[str, ...]:
     )
 
 
-def _pose(off_m: float, off_deg: float) -> str:
-    return f"{off_m:.3f} m, {off_deg:.2f}°" if np.isfinite(off_m) else "no pose"
+def _pose(off_m: float | None, off_deg: float | None, unit: str = "m") -> str:
+    """JSON has null where there was no pose."""
+    if off_m is None or off_deg is None or not np.isfinite(off_m):
+        return "no pose"
+    return f"{off_m:.3f} {unit}, {off_deg:.2f}°"
 
 
 def _percent(share: float) -> str:
@@ -127,11 +130,49 @@ def _verdict(both_less: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
     worse = []
     for way, metrics in both_less.items():
         for metric, (difference, low, high) in metrics.items():
-            if low > 0:
+            if low is not None and low > 0:  # null is minus infinity: with a network, both always answer
                 scale = 100 if metric == "wrong" else 1
                 numbers = " to ".join(f"{scale * each:.3g}" for each in (low, high))
                 worse.append(f"worse than {way}: {scale * difference:+.3g} ({numbers}) {_METRICS[metric]}")
     return "; ".join(worse) or "not worse"
+
+
+def overview(results: Sequence[Mapping[str, Any]]) -> str:
+    """Errors on undisturbed pictures, and what each way costs: a table in Markdown, a row a scene and way."""
+    far = f"over {FAR_M} m or {FAR_DEG:.0f}° off"
+    lines = [f"| | | median | mean | {far} | a query | size | preparation |", "|---" * 8 + "|"]
+    for result in results:
+        name = result["label"]
+        for way, of in result["disturbances"]["undisturbed"]["ways"].items():
+            parts = [result[part] for part in ("network", "map") if way in (part, "both") and result[part]]
+            taken_s = [part["preparation_cpu_s"] for part in parts]
+            cells = (
+                _pose(of["position_error_m"], of["rotation_error_deg"], result["unit"]),
+                _pose(of["position_error_mean_m"], of["rotation_error_mean_deg"], result["unit"]),
+                _percent(of["wrong"]),
+                f"{of['query_cpu_ms']:.0f} ms",
+                f"{sum(part['bytes'] for part in parts) / 2**20:.2f} MiB",
+                "" if None in taken_s else f"{sum(taken_s):.3g} core-s",
+            )
+            lines.append("| " + " | ".join((name, way, *cells)) + " |")
+            name = ""
+    return "\n".join((*lines, ""))
+
+
+def by_disturbance(result: Mapping[str, Any]) -> str:
+    """Median errors and the share of wrong poses of one scene: a table in Markdown, a row a disturbance."""
+    ways = list(result["disturbances"]["undisturbed"]["ways"])
+    last = ways[-1]
+    lines = [f"| {result['label']} | {' | '.join(ways)} | accepted | of these wrong (95 %) | both |"]
+    lines.append("|---" * (4 + len(ways)) + "|")
+    for name, measured in result["disturbances"].items():
+        cells = [
+            f"{_pose(of['position_error_m'], of['rotation_error_deg'], result['unit'])}; {100 * of['wrong']:.0f} %"
+            for of in measured["ways"].values()
+        ]
+        compared = _verdict(measured["both_less"]) if last == "both" else ""
+        lines.append("| " + " | ".join((name, *cells, *_cells(measured["ways"][last], last)[5:7], compared)) + " |")
+    return "\n".join((*lines, ""))
 
 
 def read_results(folders: Sequence[Path]) -> list[dict[str, Any]]:

@@ -23,12 +23,20 @@ from mambaloc.runtime import Localiser
 from mambaloc.runtime.maps import MAP_FILE, SparseMap
 
 
-def measure_robustness(recipe: MapRecipe, checkpoint: Path | None, hold_out: str | None, unit: str, out: Path) -> str:
+def measure_robustness(
+    recipe: MapRecipe,
+    checkpoint: Path | None,
+    training_cpu_s: float | None,
+    hold_out: str | None,
+    unit: str,
+    out: Path,
+) -> str:
     """Build a map, export a network, measure both under every disturbance, and write the result to a folder.
 
     Args:
         recipe: scene and settings of the map.
         checkpoint: of a network of the same scene; only the map is measured without one.
+        training_cpu_s: what its training took; it is only written down.
         hold_out: a sequence of the training frames to measure on, see :func:`key_and_query`.
         unit: of the scene's positions.
         out: the folder.
@@ -44,7 +52,7 @@ def measure_robustness(recipe: MapRecipe, checkpoint: Path | None, hold_out: str
         out.mkdir(parents=True, exist_ok=True)
     sparse_map, map_cpu_s = timed_map(train, recipe)
     sparse_map.save(out / MAP_FILE)
-    network, about_network = _network(checkpoint, out / "model.onnx") if checkpoint else (None, None)
+    network, about_network = _network(checkpoint, training_cpu_s, out / "model.onnx") if checkpoint else (None, None)
     cv2.setNumThreads(1)
     found = measure(sparse_map, network, queries, recipe.ransac_seeds)
     about = {
@@ -99,7 +107,7 @@ def timed_map(train: PosedFrames, recipe: MapRecipe) -> tuple[SparseMap, float]:
     return sparse_map, time.process_time() - start
 
 
-def _network(path: Path, onnx: Path) -> tuple[Localiser, dict[str, Any]]:
+def _network(path: Path, training_cpu_s: float | None, onnx: Path) -> tuple[Localiser, dict[str, Any]]:
     """Export a checkpoint, for one thread; and what it is."""
     checkpoint = Checkpoint.read(path)
     system = checkpoint.system()
@@ -108,6 +116,7 @@ def _network(path: Path, onnx: Path) -> tuple[Localiser, dict[str, Any]]:
         "model": system.registry_name,
         "selection": checkpoint.selection,
         "bytes": onnx.stat().st_size,
+        "preparation_cpu_s": training_cpu_s,
         "training": checkpoint.describe(),
     }
     return Localiser(onnx, threads=1, sparse_map=False), about
