@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
+from mambaloc.console import progress
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb, read_image
 from mambaloc.mapping.keyframes import farthest_first
@@ -126,7 +126,7 @@ def _within(views: NDArray[np.bool_], most_bytes: int) -> Indices:
 
 
 def _each(pool: ThreadPoolExecutor, work: Callable[[S], T], items: Sequence[S], name: str) -> list[T]:
-    return list(track(pool.map(work, items), f"{name:9}", len(items), transient=True))
+    return list(progress(pool.map(work, items), name, len(items)))
 
 
 def _features(frames: PosedFrames, row: int, width: int) -> Features:
