@@ -159,7 +159,7 @@ def test_table_says_where_both_are_worse_and_how_many_accepted_poses_are_wrong()
             "both": answers(bad, is_accepted=rule),
         },
     }
-    result = summarise(found, ["a"] * 200, {"label": "room"})
+    result = summarise(found, ["a"] * 200, {"label": "room", "unit": "m"})
     lines = table(result).splitlines()
     assert lines[4].endswith("| not worse |")
     assert "worse than map: +0.22 (0.22 to 0.22) m median; worse than map: +100 (100 to 100) % wrong |" in lines[7]
@@ -217,7 +217,7 @@ def test_a_map_alone_is_measured(room):
         patch.setattr(maps_robustness, "DISTURBANCES", {"undisturbed": DISTURBANCES["undisturbed"]})
         found = measure(sparse_map, None, queries, [0])
     assert list(found["undisturbed"]) == ["map"]
-    assert "| undisturbed | map |" in table(summarise(found, ["walk"] * 4, {"label": "room"}))
+    assert "| undisturbed | map |" in table(summarise(found, ["walk"] * 4, {"label": "room", "unit": "m"}))
 
 
 def test_colmap_localises_in_the_same_room(room, tmp_path):

@@ -91,21 +91,21 @@ def table(result: Mapping[str, Any]) -> str:
     for name, measured in result["disturbances"].items():
         for way, of in measured["ways"].items():
             compared = _verdict(measured["both_less"]) if way == "both" else ""
-            lines.append("| " + " | ".join((name, way, *_cells(of, way), compared)) + " |")
+            lines.append("| " + " | ".join((name, way, *_cells(of, way, result["unit"]), compared)) + " |")
             name = ""
     share, low, high = result["accepted_and_wrong"]
     pooled = f"{_percent(share)} ({100 * low:.2f} to {100 * high:.2f})"
     return "\n".join((*lines, "", f"Accepted and wrong over all rows: {pooled} of {result['accepted']:.0f} poses.", ""))
 
 
-def _cells(of: Mapping[str, Any], way: str) -> tuple[str, ...]:
+def _cells(of: Mapping[str, Any], way: str, unit: str) -> tuple[str, ...]:
     low, high = of["accepted_and_wrong_interval"]
     has_rule = way != "network" and of["accepted"]
     wrong = f"{_percent(of['accepted_and_wrong'])} ({100 * low:.1f} to {100 * high:.1f})" if has_rule else ""
     return (
-        _pose(of["position_error_m"], of["rotation_error_deg"]),
-        _pose(of["position_error_mean_m"], of["rotation_error_mean_deg"]),
-        _pose(of["position_error_worst_m"], of["rotation_error_worst_deg"]),
+        _pose(of["position_error_m"], of["rotation_error_deg"], unit),
+        _pose(of["position_error_mean_m"], of["rotation_error_mean_deg"], unit),
+        _pose(of["position_error_worst_m"], of["rotation_error_worst_deg"], unit),
         _percent(of["above_20cm"]),
         _percent(of["above_5deg"]),
         "" if way == "network" else _percent(of["accepted"]),
@@ -114,7 +114,7 @@ def _cells(of: Mapping[str, Any], way: str) -> tuple[str, ...]:
     )
 
 
-def _pose(off_m: float | None, off_deg: float | None, unit: str = "m") -> str:
+def _pose(off_m: float | None, off_deg: float | None, unit: str) -> str:
     """JSON has null where there was no pose."""
     if off_m is None or off_deg is None or not np.isfinite(off_m):
         return "no pose"
@@ -171,7 +171,11 @@ def by_disturbance(result: Mapping[str, Any]) -> str:
             for of in measured["ways"].values()
         ]
         compared = _verdict(measured["both_less"]) if last == "both" else ""
-        lines.append("| " + " | ".join((name, *cells, *_cells(measured["ways"][last], last)[5:7], compared)) + " |")
+        lines.append(
+            "| "
+            + " | ".join((name, *cells, *_cells(measured["ways"][last], last, result["unit"])[5:7], compared))
+            + " |"
+        )
     return "\n".join((*lines, ""))
 
 
