@@ -1,5 +1,9 @@
 """Build a sparse map and measure it: python tools/map.py RECIPE.yaml|SCENE [--frames N] [--width PX] [--out FOLDER]."""
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: on small matrices threads only wait for each other
+
 import argparse
 from dataclasses import replace
 from pathlib import Path
