@@ -1,5 +1,6 @@
 """Plots."""
 
+from mambaloc.viz.agreement import draw_agreement
 from mambaloc.viz.capture import draw_capture
 from mambaloc.viz.features import draw_features, position_features, principal_colors
 from mambaloc.viz.heatmaps import BranchHeat, draw_heat_maps, heat_maps
@@ -9,6 +10,7 @@ from mambaloc.viz.trajectory import draw_trajectory
 
 __all__ = [
     "BranchHeat",
+    "draw_agreement",
     "draw_capture",
     "draw_features",
     "draw_heat_maps",
