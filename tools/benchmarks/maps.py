@@ -13,7 +13,7 @@ from pathlib import Path
 
 from maps_report import by_disturbance, draw, overview, read_results
 
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import exits_cleanly, quieten, whole_number
 from mambaloc.mapping.recipe import MapRecipe, read_recipe
 
 
@@ -26,9 +26,11 @@ def main() -> None:
     robustness, colmap, report = (commands.add_parser(name) for name in ("robustness", "colmap", "report"))
     for command in (robustness, colmap):
         command.add_argument("source", type=Path, metavar="RECIPE|SCENE", help="as tools/map.py takes it")
-        command.add_argument("--frames", type=int, help="key frames; the recipe's unless given")
-        command.add_argument("--width", type=int, help="of the pictures in which keypoints are searched, in pixels")
-        command.add_argument("--seeds", type=int, nargs="+", help="of RANSAC; the recipe's unless given")
+        command.add_argument("--frames", type=whole_number(2), help="key frames; the recipe's unless given")
+        command.add_argument(
+            "--width", type=whole_number(32), help="of the pictures in which keypoints are searched, in pixels"
+        )
+        command.add_argument("--seeds", type=whole_number(0), nargs="+", help="of RANSAC; the recipe's unless given")
         command.add_argument(
             "--hold-out", metavar="SEQUENCE", help="of the training frames: measure on it, not on test"
         )

@@ -216,16 +216,16 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
 def _draw_medians(axes: Axes, result: Mapping[str, Any]) -> None:
     values = _values(result, "position_error_m")
     finite = [each for of in values.values() for each in of if np.isfinite(each)]
-    low, lost = min(finite) / 1.5, max(finite) * 1.6
+    low, lost = min(finite) / 1.5, max(finite) * 1.8
     axes.set(xscale="log", xlim=(low, lost * 1.5), xlabel=f"median position error [{result['unit']}]")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if lost < 50 * low else (1,)))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if lost < 200 * low else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_locator(NullLocator())
     _draw_marks(axes, {way: [min(each, lost) for each in of] for way, of in values.items()}, result)
     for row, each in enumerate(values["map"]):
         if not np.isfinite(each):
-            axes.annotate("no pose", (lost, row), (-7, 0), textcoords="offset points", fontsize=9, ha="right",
-                          va="center", color=_WAYS["map"][0])  # fmt: skip
+            axes.annotate("no pose", (lost, row), (6, -7), textcoords="offset points", fontsize=9, ha="right",
+                          va="top", color=_WAYS["map"][0])  # fmt: skip
 
 
 def _draw_tails(axes: Axes, result: Mapping[str, Any]) -> None:

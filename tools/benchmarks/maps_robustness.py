@@ -11,9 +11,8 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from maps_disturbances import DISTURBANCES
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
+from mambaloc.console import progress
 from mambaloc.images import read_image
 from mambaloc.mapping.building import PosedFrames
 from mambaloc.runtime import Localiser
@@ -102,9 +101,7 @@ def measure(
     for number, (name, disturb) in enumerate(DISTURBANCES.items()):
         rows: dict[str, list[Floats]] = {}
         shots = list(zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True))
-        for row, (image, intrinsics, truth) in enumerate(
-            track(shots, f"{name:24}", console=Console(stderr=True), transient=True)
-        ):
+        for row, (image, intrinsics, truth) in enumerate(progress(shots, f"{name:24}", len(shots))):
             rgb = read_image(image) if isinstance(image, Path) else image
             picture = disturb(rgb, np.random.default_rng((number, row)))
             sizes = ((each.shape[1], each.shape[0]) for each in (rgb, picture))
