@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.runtime.maps import MapLocaliser, SparseMap
 from mambaloc.runtime.maps.absolute_pose import CameraPose
+from mambaloc.runtime.maps.features import Features, rescaled_intrinsics
 
 SETTINGS = MapSettings(key_frames=40, width=160)
 
@@ -230,3 +232,13 @@ def test_a_prior_never_makes_an_answer_worse(room, other_walk, off_m, off_deg):
             assert _errors(both, truth)[0] < 0.3
         if off_deg > 90:
             assert not both.is_confirmed
+
+
+def test_the_lens_of_the_maps_camera_is_that_of_smaller_pictures_too(room):
+    localiser = MapLocaliser(room)
+    width, height = room.size
+    for size, own in (((width, height), True), ((width // 4, height // 4), True), ((width, width), False)):
+        matrix = rescaled_intrinsics(room.intrinsics, room.size, size)
+        features = Features(np.empty((0, 2)), np.empty((0, 128), np.float32), matrix, size)
+        assert localiser._is_own_camera(features) == own
+        assert not localiser._is_own_camera(replace(features, intrinsics=matrix * [[1.05], [1.05], [1]]))

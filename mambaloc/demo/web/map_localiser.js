@@ -141,8 +141,9 @@ export class MapLocaliser {
     const { lens, intrinsics, width, height } = this.#map;
     const rays = features.pixels.map((value, i) => (i % 2 ? (value - cy) / fy : (value - cx) / fx));
     const isSame = (a, b) => Math.abs(a - b) <= SAME * width;
-    const isOwn = isSame(grey.width, width) && isSame(grey.height, height);
-    if (isOwn && Object.keys(camera).every((name) => isSame(camera[name], intrinsics[name]))) straighten(rays, lens);
+    const asLarge = rescaled(camera, grey, { width, height });
+    const isOwn = Object.keys(camera).every((name) => isSame(asLarge[name], intrinsics[name]));
+    if (isOwn && isSame((grey.height * width) / grey.width, height)) straighten(rays, lens);
     const end = { x: grey.width - 0.5, y: grey.height - 0.5 };
     const corners = [(-0.5 - cx) / fx, (-0.5 - cy) / fy, (end.x - cx) / fx, (end.y - cy) / fy];
     return { ...features, rays, corners };

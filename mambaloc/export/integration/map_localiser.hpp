@@ -143,8 +143,8 @@ class MapLocaliser {
       cv::sqrt(row / std::max(cv::sum(row)[0], 1.0), row);  // RootSIFT
     }
     seen.descriptors = found;
-    const bool is_own = cv::norm(small - intrinsics_, cv::NORM_INF) <= 0.01 * size_.width &&
-                        std::max(std::abs(size.width - size_.width), std::abs(size.height - size_.height)) <= 0.01 * size_.width;
+    const bool is_own = cv::norm(rescaled(small, size, size_) - intrinsics_, cv::NORM_INF) <= 0.01 * size_.width &&
+                        std::abs(double(size.height) * size_.width / size.width - size_.height) <= 0.01 * size_.width;
     for (const auto& each : keypoints) {
       const cv::Vec2d ray = normalised(small, each.pt.x, each.pt.y);
       seen.rays.push_back(is_own ? undistorted(ray) : ray);

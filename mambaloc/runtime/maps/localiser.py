@@ -186,10 +186,11 @@ class MapLocaliser:
         return np.asarray(self._views[:, nearest].any(axis=1))
 
     def _is_own_camera(self, features: Features) -> bool:
-        """Whether a picture claims to be of the map's camera, whose lens is known."""
-        width = self.map.size[0]
-        is_same = np.allclose(features.intrinsics, self.map.intrinsics, rtol=0, atol=0.01 * width)
-        return is_same and bool(np.allclose(features.size, self.map.size, rtol=0, atol=0.01 * width))
+        """Whether a picture, of any resolution, claims to be of the map's camera, whose lens is known."""
+        (width, height), most = self.map.size, 0.01 * self.map.size[0]
+        as_large = rescaled_intrinsics(features.intrinsics, features.size, self.map.size)
+        has_shape = abs(features.size[1] * width / features.size[0] - height) <= most
+        return has_shape and bool(np.allclose(as_large, self.map.intrinsics, rtol=0, atol=most))
 
     def _intrinsics(self, image: Image) -> Floats:
         height, width = image.shape[:2]
