@@ -12,7 +12,7 @@ from mambaloc.importing.canonical import Imported
 from mambaloc.importing.checks.conventions import up_of
 from mambaloc.importing.motion import motion_of
 from mambaloc.importing.splits.selection import RULE, Proposal
-from mambaloc.viz import draw_capture
+from mambaloc.viz.capture import draw_capture
 
 REPORT_FILE, PLOT_FILE = "report.md", "trajectory.png"
 _IN_TERMINAL = ("frames", "poses", "images and poses", "up", "steps", "extent")

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from mambaloc.viz.trajectory import write_png
+from mambaloc.viz.png import write_png
 
 COLORS = {"test": "#d73027", "val": "#f39c12", "train": "#2166ac", "unused": "#b0b0b0"}
 _JUMP_COLOR = "#8e44ad"
