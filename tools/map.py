@@ -12,7 +12,7 @@ from mambaloc.mapping.recipe import MapRecipe, read_recipe
 
 @exits_cleanly
 def main(argv: list[str] | None = None) -> None:
-    """Build from training frames, measure on test frames, write map.npz and metrics.json."""
+    """Build from training frames, measure on test frames, write map.safetensors and metrics.json."""
     quieten()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("source", type=Path, metavar="RECIPE|SCENE", help="a YAML file, or an imported scene's folder")
@@ -28,7 +28,7 @@ def main(argv: list[str] | None = None) -> None:
     settings = replace(recipe.settings, **{key: value for key, value in given.items() if value is not None})
     out = args.out or Path("runs", args.source.resolve().stem)
     result = build_and_measure(replace(recipe, settings=settings), out)
-    print(f"{out}: map.npz, metrics.json", describe(result), sep="\n")
+    print(f"{out}: map.safetensors, metrics.json", describe(result), sep="\n")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from mambaloc.files import sha256, whole_file, writing
 from mambaloc.images import read_image
 from mambaloc.mapping.building import PosedFrames, build_map
 from mambaloc.mapping.recipe import MapRecipe
-from mambaloc.runtime.maps import MapLocaliser, SparseMap
+from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
 from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.float64]
@@ -105,7 +105,7 @@ def measure(sparse_map: SparseMap, frames: PosedFrames, seeds: Sequence[int]) ->
 def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
     """Build a recipe's map from its training frames, measure it on its test frames, and write both to a folder.
 
-    Writes ``map.npz`` and ``metrics.json``.
+    Writes ``map.safetensors`` and ``metrics.json``.
 
     Returns:
         What ``metrics.json`` holds, with infinity where that has null.
@@ -119,7 +119,7 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
     started, cpu = time.perf_counter(), time.process_time()
     sparse_map = build_map(train, recipe.settings, name)
     core_seconds = time.process_time() - cpu
-    sparse_map.save(out / "map.npz")
+    sparse_map.save(out / MAP_FILE)
     metrics = measure(sparse_map, test, recipe.ransac_seeds).summary()
     result = {
         "metrics": metrics,
@@ -136,8 +136,8 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
         "map": {
             "settings": asdict(recipe.settings),
             "points": len(sparse_map),
-            "mib": (out / "map.npz").stat().st_size / 2**20,
-            "sha256": sha256(out / "map.npz"),
+            "mib": (out / MAP_FILE).stat().st_size / 2**20,
+            "sha256": sha256(out / MAP_FILE),
             "digests": sparse_map.digests,
             "core_seconds": core_seconds,
         },

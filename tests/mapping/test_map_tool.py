@@ -40,7 +40,7 @@ def test_a_recipe_is_built_measured_and_written(den, tmp_path, capsys):
     recipe.write_text(yaml.safe_dump({"scene": "den", "root": str(den), "width": 160, "ransac_seeds": [0, 1]}))
     main([str(recipe), "--frames", "30", "--out", str(tmp_path / "out")])
     last = capsys.readouterr().out.splitlines()[-1]
-    sparse_map = SparseMap.load(tmp_path / "out" / "map.npz")
+    sparse_map = SparseMap.load(tmp_path / "out" / "map.safetensors")
     result = json.loads((tmp_path / "out" / "metrics.json").read_text())
     metrics = result["metrics"]
     assert last.startswith(f"den: median {metrics['position_error_m']:.3f} m / {metrics['rotation_error_deg']:.2f} deg")
@@ -131,4 +131,4 @@ def test_real_frames_are_localised_to_centimetres(blocks, tmp_path):
     metrics = build_and_measure(recipe, tmp_path)["metrics"]
     assert metrics["position_error_m"] < 0.05
     assert metrics["rotation_error_deg"] < 2
-    assert (tmp_path / "map.npz").stat().st_size <= 2**18
+    assert (tmp_path / "map.safetensors").stat().st_size <= 2**18

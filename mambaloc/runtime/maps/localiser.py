@@ -83,12 +83,15 @@ class MapLocaliser:
         self._unit_m = spread_m(sparse_map.key_poses)
         self._viewpoints = viewpoints(sparse_map.key_poses, self._unit_m)
 
-    def localise(self, image: Image, intrinsics: ArrayLike | None = None) -> MapLocalisation:
+    def localise(
+        self, image: Image, intrinsics: ArrayLike | None = None, prior: CameraPose | None = None
+    ) -> MapLocalisation:
         """Localise one picture.
 
         Args:
             image: RGB (H, W, 3) or grey (H, W), ``uint8``, of any size, without distortion.
             intrinsics: (3, 3) pinhole matrix in pixels of it; the map's camera unless given.
+            prior: a pose to search around where all points at once find none, such as a network's.
 
         Raises:
             InputError: for another kind of array, intrinsics that do not fit the picture, or none for a picture of
@@ -98,14 +101,14 @@ class MapLocaliser:
         matrix = self._intrinsics(rgb) if intrinsics is None else np.asarray(intrinsics, np.float64)
         check_intrinsics(matrix, (rgb.shape[1], rgb.shape[0]))
         # So that things are as large as in the map's pictures, whatever the lens.
-        return self.localise_features(detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0]))
+        return self.localise_features(detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0]), prior)
 
-    def localise_features(self, features: Features) -> MapLocalisation:
+    def localise_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalisation:
         """Localise a picture whose keypoints are found already."""
         near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
         best, is_clear = unambiguous(features.descriptors @ self._descriptors[:_AT_ONCE].T, _RATIO)
         rng = np.random.default_rng(self.seed)
-        pose = ransac_pose(self._points_m[best[is_clear]], features.rays[is_clear], near, rng)
+        pose = ransac_pose(self._points_m[best[is_clear]], features.rays[is_clear], near, rng) or prior
         if pose is None:
             return _nowhere()
         scale = near / 2  # of the refinement; finer where the matches are

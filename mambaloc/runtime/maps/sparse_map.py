@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
@@ -18,20 +19,11 @@ from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.runtime.maps.features import check_intrinsics
 
 VERSION = 1
+MAP_FILE = "map.safetensors"
+"""What a map is called in the folders that tools write."""
 _MOST_POINTS = 10**7
 _MOST_BYTES = 2**31
-_DAMAGE = (
-    ValueError,
-    KeyError,
-    TypeError,
-    EOFError,
-    NotImplementedError,
-    RecursionError,
-    RuntimeError,
-    MemoryError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+_DAMAGE = (ValueError, KeyError, TypeError, RecursionError, MemoryError, SafetensorError)
 
 
 @dataclass(frozen=True)
@@ -69,25 +61,34 @@ class SparseMap:
         return len(self.points_m)
 
     def save(self, path: Path) -> None:
-        """Write it to an ``.npz`` file, whole or not at all.
+        """Write it to a safetensors file, whole or not at all.
+
+        The header's metadata hold one entry, ``about``: JSON with the format's version, the scene, the rule of
+        acceptance, digests, and a CRC-32 of the arrays in the order of their names.
 
         Raises:
             InputError: where it cannot be written.
         """
-        about = {"version": VERSION, "scene": self.scene, "least_inliers": self.least_inliers, "digests": self.digests}
+        arrays: dict[str, NDArray[Any]] = {
+            "points_m": self.points_m,
+            "descriptors": self.descriptors,
+            "views": self.views,
+            "key_poses": self.key_poses,
+            "size": np.array(self.size, np.int64),
+            "intrinsics": self.intrinsics,
+        }
+        about = {
+            "version": VERSION,
+            "scene": self.scene,
+            "least_inliers": self.least_inliers,
+            "digests": self.digests,
+            "crc32": _crc32(arrays),
+        }
+        whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         with writing(path, "choose another file with --out"):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(path) as partial, partial.open("wb") as file:
-                np.savez_compressed(
-                    file,
-                    about=np.frombuffer(json.dumps(about).encode(), np.uint8),
-                    points_m=self.points_m,
-                    descriptors=self.descriptors,
-                    views=self.views,
-                    key_poses=self.key_poses,
-                    size=np.array(self.size, np.int64),
-                    intrinsics=self.intrinsics,
-                )
+            with whole_file(path) as partial:
+                partial.write_bytes(save(whole, {"about": json.dumps(about)}))
 
     @classmethod
     def load(cls, path: Path) -> SparseMap:
@@ -97,13 +98,13 @@ class SparseMap:
             InputError: where it is missing, damaged, not a map, or of a newer version.
         """
         try:
-            with zipfile.ZipFile(path) as file:
-                if sum(entry.file_size for entry in file.infolist()) > _MOST_BYTES:
-                    raise ValueError(f"it unpacks to more than {_MOST_BYTES} bytes")
-            with np.load(path, allow_pickle=False) as arrays:
-                about = json.loads(arrays["about"].tobytes())
-                if about["version"] <= VERSION:
-                    return cls._checked(about, {name: arrays[name] for name in _ARRAYS})
+            if path.stat().st_size > _MOST_BYTES:
+                raise ValueError(f"it is larger than {_MOST_BYTES} bytes")
+            data = path.read_bytes()
+            arrays = load(data)  # checks the header's length and offsets, so that the header can be read
+            about = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["about"])
+            if about["version"] <= VERSION:
+                return cls._checked(about, {name: arrays[name] for name in _ARRAYS})
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error}). tools/map.py writes maps.") from None
         except (*_DAMAGE, InputError) as error:
@@ -120,6 +121,8 @@ class SparseMap:
             fits = len(given.shape) == len(shape) and all(b in (0, a) for a, b in zip(given.shape, shape, strict=True))
             if given.dtype != dtype or not fits:
                 raise ValueError(f"{name} is {given.dtype} {given.shape}")
+        if about["crc32"] != _crc32(arrays):
+            raise ValueError("its checksum differs")
         points, key_poses, (width, height) = arrays["points_m"], arrays["key_poses"], map(int, arrays["size"])
         counts = {len(points), len(arrays["descriptors"]), len(arrays["views"])}
         if len(counts) != 1 or not 0 < len(points) <= _MOST_POINTS:
@@ -146,3 +149,8 @@ _ARRAYS = {  # a side of 0 may have any length
     "size": (np.int64, (2,)),
     "intrinsics": (np.float64, (3, 3)),
 }
+
+
+def _crc32(arrays: dict[str, NDArray[Any]]) -> int:
+    """Of all bytes: safetensors itself does not notice a changed number."""
+    return zlib.crc32(b"".join(arrays[name].tobytes() for name in sorted(arrays)))

@@ -3,9 +3,11 @@
 import contextlib
 import dataclasses
 import json
+import zlib
 
 import numpy as np
 import pytest
+from safetensors.numpy import load, save
 
 from mambaloc.errors import InputError
 from mambaloc.runtime.maps.sparse_map import VERSION, SparseMap
@@ -28,14 +30,14 @@ def sparse_map():
 
 
 def test_a_map_comes_back_as_it_was(sparse_map, tmp_path):
-    path = tmp_path / "new" / "map.npz"
+    path = tmp_path / "new" / "map.safetensors"
     sparse_map.save(path)
     loaded = SparseMap.load(path)
     for field in dataclasses.fields(SparseMap):
         before, after = getattr(sparse_map, field.name), getattr(loaded, field.name)
         assert type(before) is type(after)
         np.testing.assert_array_equal(before, after)
-    assert [file.name for file in path.parent.iterdir()] == ["map.npz"]
+    assert [file.name for file in path.parent.iterdir()] == ["map.safetensors"]
 
 
 def test_the_same_map_is_the_same_file(sparse_map, tmp_path):
@@ -44,24 +46,26 @@ def test_the_same_map_is_the_same_file(sparse_map, tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-def _arrays(path):
-    with np.load(path) as arrays:
-        return dict(arrays)
+def _parts(path):
+    data = path.read_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    return load(data), json.loads(header["__metadata__"]["about"])
 
 
-def _about(**changes):
-    about = {"version": VERSION, "scene": "den", "least_inliers": 12, "digests": {}, **changes}
-    return np.frombuffer(json.dumps(about).encode(), np.uint8)
+def _write(path, arrays, about):
+    """With the checksum that the arrays have, so that only what was changed is wrong."""
+    if isinstance(about, dict):
+        about["crc32"] = zlib.crc32(b"".join(arrays[name].tobytes() for name in sorted(arrays)))
+    path.write_bytes(save(arrays, {"about": about if isinstance(about, str) else json.dumps(about)}))
 
 
 CHANGES = {
-    "a newer version": {"about": _about(version=VERSION + 1)},
-    "a version that is a word": {"about": _about(version="x")},
-    "no JSON": {"about": np.frombuffer(b"[[", np.uint8)},
-    "a list for a record": {"about": np.frombuffer(b"[]", np.uint8)},
-    "digests that are a number": {"about": _about(digests=3)},
-    "inliers that are a word": {"about": _about(least_inliers="many")},
-    "pickled points": {"points_m": np.array([{"a": 1}], dtype=object)},
+    "a newer version": {"about": {"version": VERSION + 1}},
+    "a version that is a word": {"about": {"version": "x"}},
+    "no JSON": {"about": "[["},
+    "a list for a record": {"about": "[]"},
+    "digests that are a number": {"about": {"digests": 3}},
+    "inliers that are a word": {"about": {"least_inliers": "many"}},
     "points in float64": {"points_m": np.zeros((9, 3))},
     "a point too few": {"points_m": np.zeros((8, 3), np.float32)},
     "NaN": {"points_m": np.full((9, 3), np.nan, np.float32)},
@@ -80,25 +84,38 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_is_no_map_is_refused_in_a_line(change, sparse_map, tmp_path):
-    path = tmp_path / "map.npz"
+    path = tmp_path / "map.safetensors"
     sparse_map.save(path)
-    np.savez(path, **{**_arrays(path), **CHANGES[change]})
+    arrays, about = _parts(path)
+    changes = dict(CHANGES[change])
+    told = changes.pop("about", {})
+    _write(path, arrays | changes, told if isinstance(told, str) else about | told)
     with pytest.raises(InputError, match=r"Update the program" if change == "a newer version" else r"Build the map"):
         SparseMap.load(path)
 
 
-@pytest.mark.parametrize("name", ["about", "points_m", "views"])
+@pytest.mark.parametrize("name", ["points_m", "views"])
 def test_a_map_that_lacks_a_part_is_refused(name, sparse_map, tmp_path):
-    path = tmp_path / "map.npz"
+    path = tmp_path / "map.safetensors"
     sparse_map.save(path)
-    np.savez(path, **{key: array for key, array in _arrays(path).items() if key != name})
+    arrays, about = _parts(path)
+    del arrays[name]
+    _write(path, arrays, about)
+    with pytest.raises(InputError, match=r"damaged or not a map"):
+        SparseMap.load(path)
+
+
+def test_a_map_without_its_description_is_refused(sparse_map, tmp_path):
+    path = tmp_path / "map.safetensors"
+    sparse_map.save(path)
+    path.write_bytes(save(_parts(path)[0]))
     with pytest.raises(InputError, match=r"damaged or not a map"):
         SparseMap.load(path)
 
 
 def test_damaged_bytes_are_refused_wherever_they_are(sparse_map, tmp_path):
     """Cut short, or with a byte changed: no other error, and hardly ever none."""
-    path = tmp_path / "map.npz"
+    path = tmp_path / "map.safetensors"
     sparse_map.save(path)
     whole = path.read_bytes()
     rng = np.random.default_rng(0)
@@ -119,16 +136,16 @@ def test_damaged_bytes_are_refused_wherever_they_are(sparse_map, tmp_path):
 
 @pytest.mark.parametrize("what", ["missing", "folder", "text"])
 def test_what_is_no_file_of_ours_is_refused(what, tmp_path):
-    path = tmp_path / "map.npz"
+    path = tmp_path / "map.safetensors"
     if what == "folder":
         path.mkdir()
     elif what == "text":
         path.write_text("hello")
-    with pytest.raises(InputError, match=r"map\.npz: (cannot be read|is damaged or not a map)"):
+    with pytest.raises(InputError, match=r"map\.safetensors: (cannot be read|is damaged or not a map)"):
         SparseMap.load(path)
 
 
 def test_a_map_that_cannot_be_written_is_told(sparse_map, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"cannot be written.*--out"):
-        sparse_map.save(tmp_path / "file" / "map.npz")
+        sparse_map.save(tmp_path / "file" / "map.safetensors")
