@@ -98,8 +98,10 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
         near = epipolar_px(settings.width)
         matches = _each(pool, lambda pair: match_pair(features, cam_from_world, pair, near), list(pairs), "matches")
     agreeing = sum(len(rows) for rows, _ in matches) / max(sum(tried for _, tried in matches), 1)
-    seen, keypoint = _tracks(features, pairs, [rows for rows, _ in matches], near)
-    points, descriptors, views = _points(features, cam_from_world, seen, keypoint, np.random.default_rng(settings.seed))
+    seen, keypoint = keypoint_tracks(features, pairs, [rows for rows, _ in matches], near)
+    points, descriptors, views = points_of_tracks(
+        features, cam_from_world, seen, keypoint, np.random.default_rng(settings.seed)
+    )
     _check_enough(scene, features, agreeing, len(points), settings.least_inliers)
     kept = _within(views, settings.most_bytes)
     return SparseMap(
@@ -138,7 +140,7 @@ def _features(frames: PosedFrames, row: int, width: int) -> Features:
     return detect_features(rgb, frames.intrinsics[row], width / rgb.shape[1])
 
 
-def _tracks(
+def keypoint_tracks(
     features: Sequence[Features], pairs: Indices, matches: Sequence[Indices], near: float
 ) -> tuple[Observations, Indices]:
     """Keypoints that matches connect, and which each is, of all frames' laid end to end (O,)."""
@@ -153,7 +155,7 @@ def _tracks(
     return Observations(frame, root[keypoint], rays[keypoint], near / focal_px[frame]).renumbered(), keypoint
 
 
-def _points(
+def points_of_tracks(
     features: Sequence[Features],
     cam_from_world: Floats,
     seen: Observations,

@@ -79,7 +79,9 @@ class MapLocaliser:
         self.seed = seed
         self._points_m = sparse_map.points_m.astype(np.float64)
         self._descriptors = dequantized(sparse_map.descriptors)
-        self._views = np.unpackbits(sparse_map.views, axis=1, count=len(sparse_map.key_poses)).view(bool)
+        self._views = sparse_map.is_seen
+        # A map's first points are in this order; those that were added to it are not.
+        self._often = np.argsort(-self._views.sum(axis=1), kind="stable")[:_AT_ONCE]
         self._unit_m = spread_m(sparse_map.key_poses)
         self._viewpoints = viewpoints(sparse_map.key_poses, self._unit_m)
 
@@ -97,18 +99,22 @@ class MapLocaliser:
             InputError: for another kind of array, intrinsics that do not fit the picture, or none for a picture of
                 another shape than the map's.
         """
+        return self.localise_features(self.features(image, intrinsics), prior)
+
+    def features(self, image: Image, intrinsics: ArrayLike | None = None) -> Features:
+        """Find a picture's keypoints as the map's were found; arguments and errors are those of :meth:`localise`."""
         rgb = as_rgb(image)
         matrix = self._intrinsics(rgb) if intrinsics is None else np.asarray(intrinsics, np.float64)
         check_intrinsics(matrix, (rgb.shape[1], rgb.shape[0]))
         # So that things are as large as in the map's pictures, whatever the lens.
-        return self.localise_features(detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0]), prior)
+        return detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0])
 
     def localise_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalisation:
         """Localise a picture whose keypoints are found already."""
         near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
-        best, is_clear = unambiguous(features.descriptors @ self._descriptors[:_AT_ONCE].T, _RATIO)
+        best, is_clear = unambiguous(features.descriptors @ self._descriptors[self._often].T, _RATIO)
         rng = np.random.default_rng(self.seed)
-        pose = ransac_pose(self._points_m[best[is_clear]], features.rays[is_clear], near, rng) or prior
+        pose = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], near, rng) or prior
         if pose is None:
             return _nowhere()
         scale = near / 2  # of the refinement; finer where the matches are
@@ -124,6 +130,11 @@ class MapLocaliser:
         deviation_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])  # in the direction that is least sure
         is_accepted = inliers >= self.map.least_inliers and bool(deviation_m <= _MOST_DEVIATION * self._unit_m)
         return MapLocalisation(pose.position_m, quaternion_from_matrix(pose.rotation), inliers, is_accepted, covariance)
+
+    def matches(self, features: Features, pose: CameraPose) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Points that a picture shows where its pose projects them: rows of keypoints and of points."""
+        near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
+        return self._search(features, pose, near)
 
     def _search(
         self, features: Features, pose: CameraPose, radius: float
@@ -149,8 +160,7 @@ class MapLocaliser:
 
         Where the poses of a capture drift, these also agree best with each other.
         """
-        place = np.concatenate((np.column_stack((pose.rotation, pose.position_m)), [(0, 0, 0, 1)]))
-        apart = ((self._viewpoints - viewpoints(place[None], self._unit_m)) ** 2).sum(axis=1)
+        apart = ((self._viewpoints - viewpoints(pose.matrix[None], self._unit_m)) ** 2).sum(axis=1)
         nearest = np.argsort(apart, kind="stable")[:_NEAREST]
         return np.asarray(self._views[:, nearest].any(axis=1))
 

@@ -45,6 +45,8 @@ class SparseMap:
         least_inliers: matches that a pose needs to be accepted.
         scene: name of the place.
         digests: of what the map was made from, by name.
+        sessions: what was added later: how many key frames each has by its name, in the order of ``key_poses``, whose
+            last they are.
     """
 
     points_m: NDArray[np.float32]
@@ -56,9 +58,15 @@ class SparseMap:
     least_inliers: int
     scene: str
     digests: dict[str, str] = field(default_factory=dict)
+    sessions: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.points_m)
+
+    @property
+    def is_seen(self) -> NDArray[np.bool_]:
+        """Which key frames (columns) see which points (rows), (P, K)."""
+        return np.unpackbits(self.views, axis=1, count=len(self.key_poses)).view(bool)
 
     def save(self, path: Path) -> None:
         """Write it to a safetensors file, whole or not at all.
@@ -82,6 +90,7 @@ class SparseMap:
             "scene": self.scene,
             "least_inliers": self.least_inliers,
             "digests": self.digests,
+            "sessions": self.sessions,
             "crc32": _crc32(arrays),
         }
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -134,10 +143,13 @@ class SparseMap:
         if not 0 < width <= LARGEST_SIDE_PX or not 0 < height <= LARGEST_SIDE_PX:
             raise ValueError(f"pictures of {width}x{height}")
         check_intrinsics(arrays["intrinsics"], (width, height))
+        sessions = {str(name): int(count) for name, count in dict(about.get("sessions", {})).items()}
+        if any(count < 1 for count in sessions.values()) or sum(sessions.values()) >= len(key_poses):
+            raise ValueError(f"sessions of {sum(sessions.values())} of {len(key_poses)} key frames")
         return cls(
             points, arrays["descriptors"], arrays["views"], key_poses, (width, height), arrays["intrinsics"],
             int(about["least_inliers"]), str(about["scene"]),
-            {str(name): str(digest) for name, digest in dict(about["digests"]).items()},
+            {str(name): str(digest) for name, digest in dict(about["digests"]).items()}, sessions,
         )  # fmt: skip
 
 
