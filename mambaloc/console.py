@@ -11,16 +11,20 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, InputWarning
 
-_MOST_THREADS = 256
+_as_usual = warnings.formatwarning
 
 
 def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a tool's ``main`` print an :class:`InputError` as one line on stderr and exit with code 2."""
+    """Make a tool's ``main`` print an :class:`InputError` as one line on stderr and exit with code 2.
+
+    An :class:`~mambaloc.errors.InputWarning` is one line there, too.
+    """
 
     @wraps(main)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
+        warnings.formatwarning = _in_a_line
         try:
             return main(*args, **kwargs)
         except KeyboardInterrupt:
@@ -35,6 +39,12 @@ def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
     return wrapper
 
 
+def _in_a_line(message: Warning | str, category: type[Warning], *where: Any, **line: Any) -> str:
+    if issubclass(category, InputWarning):
+        return f"warning: {message}\n"
+    return _as_usual(message, category, *where, **line)
+
+
 def _user_mistake(error: BaseException | None) -> InputError | None:
     """Find an InputError that a library wrapped in an error of its own."""
     while error is not None and not isinstance(error, InputError):
@@ -42,11 +52,29 @@ def _user_mistake(error: BaseException | None) -> InputError | None:
     return error
 
 
-def thread_count(text: str) -> int:
-    """Read an option's number of threads, for :mod:`argparse`."""
-    if not text.isdecimal() or not 1 <= int(text) <= _MOST_THREADS:
-        raise argparse.ArgumentTypeError(f"{text}: give a number of threads from 1 to {_MOST_THREADS}")
-    return int(text)
+def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Make a reader of an option's whole number within bounds, for :mod:`argparse`."""
+
+    def read(text: str) -> int:
+        if not text.isdecimal() or not least <= int(text) <= (int(text) if most is None else most):
+            bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
+            raise argparse.ArgumentTypeError(f"{text}: give a whole number {bounds}")
+        return int(text)
+
+    return read
+
+
+thread_count = whole_number(1, 256)
+"""Reads an option's number of threads."""
+
+
+def pinhole_matrix(text: str) -> list[list[float]]:
+    """Read an option's ``FX,FY,CX,CY`` as a (3, 3) matrix, for :mod:`argparse`."""
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}: give FX,FY,CX,CY in pixels") from None
+    return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
 
 
 def quieten() -> None:

@@ -1,9 +1,10 @@
+import argparse
 import subprocess
 import sys
 
 import pytest
 
-from mambaloc.console import exits_cleanly
+from mambaloc.console import exits_cleanly, thread_count, whole_number
 from mambaloc.errors import InputError
 
 
@@ -35,3 +36,16 @@ def test_a_bug_keeps_its_traceback():
 def test_package_alone_imports_without_torch():
     code = "import sys, mambaloc; assert mambaloc.__version__; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "257", "2.5", "two", "", "²"])
+def test_a_number_of_threads_is_whole_and_within_bounds(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="give a whole number from 1 to 256"):
+        thread_count(text)
+    assert thread_count("256") == 256
+
+
+def test_a_whole_number_may_have_no_upper_bound():
+    assert whole_number(32)("100000") == 100_000
+    with pytest.raises(argparse.ArgumentTypeError, match="31: give a whole number of at least 32"):
+        whole_number(32)("31")

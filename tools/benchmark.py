@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mambaloc import benchmark, list_models, provenance
-from mambaloc.console import exits_cleanly, quieten, thread_count
+from mambaloc.console import exits_cleanly, quieten, thread_count, whole_number
 from mambaloc.errors import InputError
 from mambaloc.models.registry import model_class
 from mambaloc.zoo.bundles import load_with_data
@@ -20,25 +20,25 @@ def main() -> None:
     part.set_defaults(call=lambda args: benchmark.print_sizes(benchmark.size_table()))
     part = parts.add_parser("latency", help="forward and training-step times with GIS, as ratios to without")
     part.add_argument("systems", nargs="*", help="names; all of them unless given")
-    part.add_argument("--image-size", type=int, default=224)
-    part.add_argument("--repetitions", type=int, default=20)
+    part.add_argument("--image-size", type=whole_number(32), default=224)
+    part.add_argument("--repetitions", type=whole_number(2), default=20)
     part.add_argument("--device", default="cpu", help="cpu or cuda")
     part.set_defaults(call=_latency)
     part = parts.add_parser("deployment", help="size, latency, errors of trained systems in every precision")
     part.add_argument("sources", nargs="+", help="checkpoints, zoo names; the first is what others are compared with")
     part.add_argument("--threads", type=thread_count, default=2)
-    part.add_argument("--repetitions", type=int, default=50)
+    part.add_argument("--repetitions", type=whole_number(2), default=50)
     part.set_defaults(call=_deployment)
     part = parts.add_parser("speed", help="where training time goes, beside the loop of published research code")
     part.add_argument("system", nargs="?", default="mambaloc")
     part.add_argument("--overlay", type=Path, action="append", default=[], help="as recipes/overlays/ holds them")
     for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
         part.add_argument(name, default=default)
-    part.add_argument("--batches", type=int, nargs="*", default=[16, 32], help="other numbers of images a step")
-    part.add_argument("--frames", type=int, nargs="*", default=[], help="numbers of frames to train an epoch on")
-    part.add_argument("--steps", type=int, default=4, help="of a repetition")
-    part.add_argument("--repetitions", type=int, default=5)
-    part.add_argument("--workers", type=int, default=2, help="loader processes of the reference")
+    part.add_argument("--batches", type=whole_number(1), nargs="*", default=[16, 32], help="other images a step")
+    part.add_argument("--frames", type=whole_number(2), nargs="*", default=[], help="of an epoch")
+    part.add_argument("--steps", type=whole_number(1), default=4, help="of a repetition")
+    part.add_argument("--repetitions", type=whole_number(2), default=5)
+    part.add_argument("--workers", type=whole_number(0), default=2, help="loader processes of the reference")
     part.add_argument("--reach", type=float, metavar="METRES", help="train a process until then, and to the end")
     part.add_argument("--out", type=Path, help="a .json file for every figure")
     part.set_defaults(call=_speed)

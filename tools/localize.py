@@ -1,9 +1,9 @@
-"""Localise pictures: python tools/localize.py [MODEL] VIDEO_OR_FOLDER_OR_CAMERA [--filter causal|smooth]."""
+"""Localise pictures: python tools/localize.py [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA [--filter causal|smooth]."""
 
 import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, thread_count
+from mambaloc.console import exits_cleanly, pinhole_matrix, thread_count
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.video import FILTERS, follow
 
@@ -13,24 +13,33 @@ def main() -> None:
     """Localise every frame and write a trajectory; Ctrl-C ends a camera's."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "model", nargs="?", help="exported model, bundle or ARCH.TAG; unless given, the embedded room's"
+        "model",
+        nargs="?",
+        metavar="MODEL|MAP",
+        help="bundle, exported model, map.safetensors or ARCH.TAG; unless given, the embedded room's",
     )
     parser.add_argument("source", help="a video, a picture, a folder of pictures (30 a second), or a camera's number")
     parser.add_argument("--out", type=Path, default=Path("poses.tum"), help="trajectory to write, TUM format")
     parser.add_argument("--filter", choices=FILTERS, help="steady a video's poses: from those before, or from all")
-    parser.add_argument("--threads", type=thread_count, help="that one image may use")
+    parser.add_argument(
+        "--intrinsics",
+        type=pinhole_matrix,
+        metavar="FX,FY,CX,CY",
+        help="of the frames, in pixels; the map's unless given",
+    )
+    maps = parser.add_mutually_exclusive_group()
+    maps.add_argument(
+        "--map", dest="sparse_map", default=True, metavar="FILE", help="beside the model; a bundle's own unless given"
+    )
+    maps.add_argument("--no-map", dest="sparse_map", action="store_false", help="let the network answer alone")
+    parser.add_argument("--threads", type=thread_count, help="that the network may use for one image")
     args = parser.parse_args()
-    localiser = Localiser(_model(args.model), args.threads)
-    done = follow(localiser, args.source, args.out, args.filter)
-    poses = f"{done.count} poses" + (f" ({done.outliers} outliers)" if args.filter else "")
-    print(f"{args.out}: {poses} in {localiser.contract.scene}, median {done.latency_ms:.1f} ms a frame")
-    if done.radii:
-        metres, degrees = done.radii
-        print(f"nine of ten within {metres:.2g} m and {degrees:.2g}°; {done.unfamiliar} do not look like the place")
+    localiser = Localiser(_model(args.model), args.threads, args.sparse_map)
+    print(f"{args.out}: {follow(localiser, args.source, args.out, args.filter, args.intrinsics)}")
 
 
 def _model(name: str | None) -> Path:
-    if name is not None and (Path(name).exists() or Path(name).suffix in (".onnx", ".ort")):
+    if name is not None and (Path(name).exists() or Path(name).suffix in (".onnx", ".ort", ".safetensors")):
         return Path(name)
     from mambaloc.zoo.bundles import EMBEDDED, released_bundle  # needs torch, which an exported model does not
 

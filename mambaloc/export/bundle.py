@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from rich.console import Console
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
+from mambaloc.export.maps import check_scene, describe_map, map_vector, scene_intrinsics
 from mambaloc.export.onnx import contract_of, export_onnx
 from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
@@ -27,6 +29,7 @@ from mambaloc.images import read_image
 from mambaloc.models import LitPoseRegressor
 from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, replay, verify_bundle
 from mambaloc.runtime.contract import METADATA_KEY, MODEL_FILES, Contract
+from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
 from mambaloc.uncertainty import UncertaintyHead, fit_uncertainty
 
 FORMATS = tuple(MODEL_FILES)
@@ -58,6 +61,7 @@ def write_bundle(
     formats: Sequence[str] = ("onnx", "fp16"),
     target: str = "android",
     raw_input: bool = False,
+    sparse_map: Path | None = None,
 ) -> WrittenBundle:
     """Write a bundle's folder; it appears once every model in it has found the poses that the system finds.
 
@@ -70,10 +74,11 @@ def write_bundle(
         formats: of ``FORMATS``.
         target: of ``TARGETS``, which its page on integration is about.
         raw_input: resize, crop and scale inside of the models, which then take RGB of any size.
+        sparse_map: file of a map of the scene, which is copied into the bundle.
 
     Raises:
-        InputError: where the folder is there or cannot be written, the test frames are not there, a model deviates, or
-            nothing is left to write.
+        InputError: where the folder is there or cannot be written, the test frames are not there, a model deviates, the
+            map is damaged or of another scene, or nothing is left to write.
     """
     if out.exists():
         raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
@@ -84,20 +89,30 @@ def write_bundle(
             uncertainty, unsure = fit_uncertainty(system, data), None
         except InputError as error:
             uncertainty, unsure = None, f"the models tell no uncertainty: {error}"
+        in_map = None if sparse_map is None else _copy_map(sparse_map, data, partial)
         contract, int8 = _write_models(system, data, partial, formats, raw_input, uncertainty)
         written = [name for name in formats if (partial / MODEL_FILES[name]).is_file()]
         if not written:
             raise InputError(f"{out}: nothing to write: {int8}")
-        frames = _write_frames(system, data, partial, contract)
+        frames = _write_frames(system, data, partial, contract, in_map)
         _write_trajectory(data, partial)
         size_m = max(1.0, float(system.network.head.position_scale.scale_m))
-        write_pages(partial, contract, data.hparams["dataset"], [MODEL_FILES[name] for name in written], target)
-        _write_contract(partial, contract, frames, written, size_m, int8)
+        models = [MODEL_FILES[name] for name in written]
+        write_pages(partial, contract, data.hparams["dataset"], models, target, None if in_map is None else in_map.map)
+        described = {} if in_map is None else {"map": describe_map(in_map.map)}
+        _write_contract(partial, contract, frames, written, size_m, int8, described)
         deviations = verify_bundle(partial)
         if bad := [each for each in deviations if not each.within]:
             worst = f"{bad[0].position_mm:.2g} mm and {bad[0].rotation_deg:.2g} deg"
-            raise InputError(f"{out / bad[0].file}: deviates by {worst} from PyTorch, so no bundle was written")
+            raise InputError(f"{out / bad[0].file}: deviates by {worst} from its original, so no bundle was written")
     return WrittenBundle(deviations, int8, unsure)
+
+
+def _copy_map(path: Path, data: PoseDataModule, folder: Path) -> MapLocaliser:
+    sparse_map = SparseMap.load(path)
+    check_scene(path, sparse_map, data)
+    shutil.copyfile(path, folder / MAP_FILE)
+    return MapLocaliser(sparse_map)
 
 
 def _write_models(
@@ -136,17 +151,17 @@ def _tell(model: onnx.ModelProto, contract: Contract) -> None:
 
 
 def _write_frames(
-    system: LitPoseRegressor, data: PoseDataModule, folder: Path, contract: Contract
+    system: LitPoseRegressor, data: PoseDataModule, folder: Path, contract: Contract, in_map: MapLocaliser | None
 ) -> list[dict[str, Any]]:
-    """Write test frames, evenly spread, with the poses that the system itself finds.
+    """Write test frames, evenly spread, with the poses that the system itself finds, and those that its map finds.
 
     As PNG: no two decoders agree on a JPEG.
     """
     frames = data.frames("test")
-    chosen = [frames.image_paths[row] for row in frames.evenly_spread(_FRAMES)]
+    chosen = frames.select(np.array(frames.evenly_spread(_FRAMES)))
     (folder / "frames").mkdir()
-    told = []
-    for number, path in enumerate(chosen):
+    told: list[dict[str, Any]] = []
+    for number, path in enumerate(chosen.image_paths):
         rgb, copy = read_image(path), f"frames/{number}.png"
         (folder / copy).write_bytes(cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
         cropped = contract.preprocessing.apply(rgb)
@@ -160,6 +175,9 @@ def _write_frames(
                 "quaternion_wxyz": canonical(prediction.quaternion)[0].tolist(),
             }
         )
+    if in_map is not None:
+        for frame, intrinsics in zip(told, scene_intrinsics(data, chosen), strict=True):
+            frame |= map_vector(in_map, folder / frame["file"], intrinsics)
     return told
 
 
@@ -181,6 +199,7 @@ def _write_contract(
     formats: Sequence[str],
     size_m: float,
     int8: EightBit | None,
+    described_map: dict[str, Any],
 ) -> None:
     """Write ``contract.json``, last of all files, since it digests them."""
     others = [path for path in sorted(folder.rglob("*")) if path.is_file()]
@@ -198,7 +217,7 @@ def _write_contract(
         else:
             allowed_mm, allowed_deg = _ALLOWED[name][0] * size_m, _ALLOWED[name][1]
         files[MODEL_FILES[name]]["allowed"] = {"position_mm": allowed_mm, "rotation_deg": allowed_deg}
-    bundle = {**json.loads(contract.to_json()), "files": files, "frames": frames}
+    bundle = {**json.loads(contract.to_json()), **described_map, "files": files, "frames": frames}
     (folder / CONTRACT_FILE).write_text(json.dumps(bundle, indent=2) + "\n", encoding="utf-8")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from mambaloc.data.datasets.registry import licence_of_weights
 from mambaloc.runtime.contract import Contract
+from mambaloc.runtime.maps import MAP_FILE, SparseMap
 
 TARGETS = ("android", "ios", "react_native", "web", "pc")
 """Kinds of app that there is a page on integration for."""
@@ -16,7 +17,9 @@ TARGETS = ("android", "ios", "react_native", "web", "pc")
 _INTEGRATION = files("mambaloc.export") / "integration"
 
 
-def write_pages(folder: Path, contract: Contract, dataset: str, models: Sequence[str], target: str) -> None:
+def write_pages(
+    folder: Path, contract: Contract, dataset: str, models: Sequence[str], target: str, sparse_map: SparseMap | None
+) -> None:
     """Write ``README.md``, ``LICENSE.txt`` and ``INTEGRATION.md``.
 
     Args:
@@ -25,10 +28,11 @@ def write_pages(folder: Path, contract: Contract, dataset: str, models: Sequence
         dataset: that they were trained on.
         models: their files.
         target: of ``TARGETS``.
+        sparse_map: beside them, where there is one.
     """
     page = (_INTEGRATION / f"{target}.md").read_text(encoding="utf-8")
     for name, text in (
-        ("README.md", _card(contract, models)),
+        ("README.md", _card(contract, models, sparse_map)),
         ("LICENSE.txt", _licence(dataset)),
         ("INTEGRATION.md", page),
     ):
@@ -38,13 +42,17 @@ def write_pages(folder: Path, contract: Contract, dataset: str, models: Sequence
 def _licence(dataset: str) -> str:
     return f"""Code and architecture: Apache-2.0.
 
-The weights follow the terms of the frames that they were trained on, and so do frames/ and trajectory.json, which
-hold some of those frames and their poses: {licence_of_weights(dataset)}
+The weights follow the terms of the frames that they were trained on, and so do frames/, trajectory.json and
+map.safetensors, which hold some of those frames, their poses and their keypoints: {licence_of_weights(dataset)}
 """
 
 
-def _card(contract: Contract, models: Sequence[str]) -> str:
-    listed = "\n".join(f"- `{name}`" for name in models)
+def _card(contract: Contract, models: Sequence[str], sparse_map: SparseMap | None) -> str:
+    files = [f"- `{name}`" for name in models]
+    if sparse_map is not None:
+        points, frames = len(sparse_map), len(sparse_map.key_poses)
+        files.append(f"- `{MAP_FILE}`: sparse map, {points} points of {frames} key frames, for poses to centimetres")
+    listed = "\n".join(files)
     trained = "\n".join(
         f"- {name}: {_in_words(value)}" for name, value in contract.trained.items() if value is not None
     )
@@ -59,7 +67,7 @@ Camera pose of one RGB image, {contract.pose}.
 - `LICENSE.txt`
 
 `python tools/verify_bundle.py FOLDER` checks it, `python tools/demo.py FOLDER` shows it in a browser. An app ships a
-model and `contract.json`; `frames/` are for checking a port.
+model, the map if there is one, and `contract.json`; `frames/` are for checking a port.
 
 ## How sure it is
 

@@ -1,8 +1,9 @@
-"""Localise with an exported model on ONNX Runtime, NumPy and OpenCV alone: nothing here imports torch."""
+"""Localise with an exported network and a sparse map on ONNX Runtime, NumPy and OpenCV: nothing here imports torch."""
 
 from mambaloc.runtime.contract import Contract, Preprocessing
 from mambaloc.runtime.filter_noise import Noise
-from mambaloc.runtime.localiser import Localisation, Localiser
+from mambaloc.runtime.localisation import Localisation, combined
+from mambaloc.runtime.localiser import Localiser
 from mambaloc.runtime.pose_filter import PoseEstimate, PoseFilter, smooth
 from mambaloc.runtime.sources import frames_of
 from mambaloc.runtime.trajectory import write_tum
@@ -15,6 +16,7 @@ __all__ = [
     "PoseEstimate",
     "PoseFilter",
     "Preprocessing",
+    "combined",
     "frames_of",
     "smooth",
     "write_tum",

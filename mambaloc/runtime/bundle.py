@@ -1,9 +1,10 @@
-"""A folder that an app ships: models, their contract, and frames with the poses that a port must find."""
+"""A folder that an app ships: models, a map, their contract, and frames with the poses that a port must find."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,21 +13,27 @@ import numpy as np
 
 from mambaloc.errors import InputError
 from mambaloc.files import sha256
+from mambaloc.images import read_image
+from mambaloc.runtime.localisation import Localisation
 from mambaloc.runtime.localiser import Localiser
+from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
 from mambaloc.runtime.rotations import rotation_error_deg
 
 CONTRACT_FILE = "contract.json"
 
+Replay = tuple[float, float, float]
+"""Largest deviation of position in millimetres and of rotation in degrees, and median latency in milliseconds."""
+
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far one model of a bundle is from the system it was exported from, over the bundle's frames.
+    """How far one model of a bundle, or its map, is from where it was exported, over the bundle's frames.
 
     Args:
-        file: the model.
+        file: the model or map.
         position_mm: largest difference of position.
         rotation_deg: largest difference of rotation.
-        latency_ms: median of the frames.
+        latency_ms: median of the frames; NaN where there was none to compare.
         within: whether both are at most what the bundle allows.
     """
 
@@ -38,7 +45,7 @@ class Deviation:
 
 
 def verify_bundle(folder: Path, threads: int | None = None) -> list[Deviation]:
-    """Check every file's digest, and replay the frames through every model.
+    """Check every file's digest, and replay the frames through every model, and the map if there is one.
 
     Raises:
         InputError: where a file is missing or not the one that was written, or something cannot be read.
@@ -53,7 +60,11 @@ def verify_bundle(folder: Path, threads: int | None = None) -> list[Deviation]:
             raise InputError(f"{path}: speaks of the frame {strange}, but not of its digest; write the bundle anew")
         if not frames or not any("allowed" in entry for entry in files.values()):
             raise InputError(f"{path}: holds no model, or no frame to check it by; write the bundle anew")
-        return list(_replayed(folder, files, frames, threads))
+        if (in_map := bundle.get("map")) is None:
+            return list(_replayed(folder, files, frames, threads))
+        if MAP_FILE not in files:
+            raise InputError(f"{path}: describes a map without the digest of {MAP_FILE}. Write the bundle again.")
+        return [*_replayed(folder, files, frames, threads), _deviation(MAP_FILE, replay_map(folder, frames), in_map)]
     except OSError as error:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}); give a bundle's folder") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -77,17 +88,38 @@ def _replayed(
     for name, entry in files.items():
         if "allowed" not in entry:  # no model
             continue
-        position_mm, angle_deg, latency_ms = replay(folder / name, frames, threads)
-        allowed = entry["allowed"]
-        within = position_mm <= allowed["position_mm"] and angle_deg <= allowed["rotation_deg"]
-        yield Deviation(name, position_mm, angle_deg, latency_ms, within)
+        yield _deviation(name, replay(folder / name, frames, threads), entry)
 
 
-def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None) -> tuple[float, float, float]:
+def _deviation(file: str, largest: Replay, entry: dict[str, Any]) -> Deviation:
+    position_mm, angle_deg, latency_ms = largest
+    allowed = entry["allowed"]
+    within = position_mm <= allowed["position_mm"] and angle_deg <= allowed["rotation_deg"]
+    return Deviation(file, position_mm, angle_deg, latency_ms, bool(within))
+
+
+def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None) -> Replay:
     """Let a model localise its bundle's frames: largest deviation in mm and degrees, and median latency in ms."""
     localiser = Localiser(model, threads)
-    found = [localiser.localise(model.parent / frame["file"]) for frame in frames]
-    pairs = list(zip(found, frames, strict=True))
-    position_mm = max(1000 * float(np.linalg.norm(p.position_m - np.array(frame["position_m"]))) for p, frame in pairs)
-    angle_deg = max(float(rotation_error_deg(p.quaternion, frame["quaternion_wxyz"])) for p, frame in pairs)
-    return position_mm, angle_deg, 1000 * float(np.median([pose.latency_s for pose in found]))
+    return _compared([(localiser.localise(model.parent / frame["file"]), frame) for frame in frames])
+
+
+def replay_map(folder: Path, frames: list[dict[str, Any]]) -> Replay:
+    """The same of a bundle's map, over the frames that it localised when the bundle was written."""
+    localiser = MapLocaliser(SparseMap.load(folder / MAP_FILE))
+    found = []
+    for frame in frames:
+        if (expected := frame["map"]) is not None:
+            rgb, start = read_image(folder / frame["file"]), time.perf_counter()
+            pose = localiser.localise(rgb, frame["intrinsics"])
+            latency_s = time.perf_counter() - start
+            found.append((Localisation(pose.position_m, pose.quaternion, latency_s), expected))
+    return _compared(found)
+
+
+def _compared(pairs: Sequence[tuple[Localisation, dict[str, Any]]]) -> Replay:
+    if not pairs:
+        return 0.0, 0.0, float("nan")
+    off_mm = [1000 * np.linalg.norm(pose.position_m - np.array(expected["position_m"])) for pose, expected in pairs]
+    off_deg = [rotation_error_deg(pose.quaternion, expected["quaternion_wxyz"]) for pose, expected in pairs]
+    return float(np.max(off_mm)), float(np.max(off_deg)), 1000 * float(np.median([pose.latency_s for pose, _ in pairs]))

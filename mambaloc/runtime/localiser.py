@@ -1,141 +1,140 @@
-"""Poses from images with an exported model."""
+"""Poses from images with an exported network, a sparse map, or both."""
 
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import onnxruntime
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from mambaloc.errors import InputError
-from mambaloc.images import Image, as_rgb, read_image, resized_size
-from mambaloc.runtime.contract import METADATA_KEY, MODEL_FILES, Contract
+from mambaloc.errors import InputError, InputWarning
+from mambaloc.images import Image, as_rgb, read_image
+from mambaloc.runtime.contract import MODEL_FILES, Contract
+from mambaloc.runtime.localisation import Localisation, combined
+from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
+from mambaloc.runtime.network import Network
+from mambaloc.runtime.rotations import matrix_from_quaternion
 from mambaloc.runtime.sources import SourceFrame, frames_of
 
 
-@dataclass(frozen=True)
-class Localisation:
-    """Where one image was taken: ``world_from_cam``.
-
-    Shape:
-        ``position_m`` (3,) camera centre in metres; ``quaternion`` (4,) unit, wxyz, ``w >= 0``.
-
-    Args:
-        position_m: in the scene's frame.
-        quaternion: likewise.
-        latency_s: seconds that preprocessing and the network took.
-        position_radius_m: the share of poses that the contract says, nine of ten, are within this; None where the
-            model does not tell.
-        rotation_radius_deg: likewise.
-        unfamiliarity: how far the image is from those that the model was trained on; over 1, hardly any frame of the
-            place is.
-    """
-
-    position_m: NDArray[np.float32]
-    quaternion: NDArray[np.float32]
-    latency_s: float
-    position_radius_m: float | None = None
-    rotation_radius_deg: float | None = None
-    unfamiliarity: float | None = None
-
-    @property
-    def is_unfamiliar(self) -> bool:
-        """Whether the image does not look like the place, so that the pose says nothing; never, where none can tell."""
-        return self.unfamiliarity is not None and not self.unfamiliarity <= 1
-
-
 class Localiser:
-    """A model on ONNX Runtime.
+    """A network, and a sparse map beside it.
+
+    The map's pose is the answer where it is accepted, and the network's otherwise. What keeps the map from being used,
+    such as a damaged file or a picture whose camera is unknown, is a warning, and the network answers.
 
     Args:
-        model: an ``.onnx`` or ``.ort`` file that ``tools/export.py`` wrote, or a bundle's folder.
-        threads: that one image may use; ONNX Runtime's choice unless given.
+        model: an ``.onnx`` or ``.ort`` file that ``tools/export.py`` wrote; a bundle's folder; or a ``.safetensors``
+            file that ``tools/map.py`` wrote, to localise in the map alone.
+        threads: that the network may use for one image; ONNX Runtime's choice unless given.
+        sparse_map: the map to use beside a network, or its file. True takes the bundle's own, if it has one; False
+            leaves it out.
 
     Raises:
-        InputError: where there is no such model, it cannot be run, or it carries no contract.
+        InputError: where there is no such model, it cannot be run, or it carries no contract; and where a map that was
+            named cannot be read.
     """
 
-    def __init__(self, model: str | Path, threads: int | None = None) -> None:
-        self.path = _model_file(Path(model))
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = 3
-        options.intra_op_num_threads = threads or 0
-        try:
-            self._session = onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # ONNX Runtime's own exceptions share no base
-            reason = str(error).splitlines()[0]
-            raise InputError(f"{self.path}: ONNX Runtime cannot load it ({reason}); export it anew") from None
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        if METADATA_KEY not in metadata:
-            raise InputError(f"{self.path}: carries no contract of its input; export it with tools/export.py")
-        self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
-        self._check_input()
+    def __init__(
+        self, model: str | Path, threads: int | None = None, sparse_map: SparseMap | str | Path | bool = True
+    ) -> None:
+        path = Path(model)
+        is_map = path.suffix == Path(MAP_FILE).suffix
+        self._network = None if is_map else Network(_model_file(path), threads)
+        found = SparseMap.load(path) if is_map else _map_beside(path, sparse_map)
+        self._map = None if found is None else MapLocaliser(found)
 
-    def localise(self, image: str | Path | Image) -> Localisation:
+    @property
+    def contract(self) -> Contract | None:
+        """The network's; None of a map alone."""
+        return None if self._network is None else self._network.contract
+
+    @property
+    def sparse_map(self) -> SparseMap | None:
+        """The map that is used."""
+        return None if self._map is None else self._map.map
+
+    @property
+    def scene(self) -> str:
+        """Name of the place, as the network's contract has it, or the map alone."""
+        if self._network is not None:
+            return self._network.contract.scene
+        assert self._map is not None  # one of the two is there
+        return self._map.map.scene
+
+    def localise(self, image: str | Path | Image, intrinsics: ArrayLike | None = None) -> Localisation:
         """Localise one image.
 
         Args:
             image: a file; or RGB (H, W, 3), or grey (H, W), ``uint8``, of any size.
+            intrinsics: (3, 3) pinhole matrix in its pixels, for the map; the map's own camera unless given, where the
+                image has its shape.
 
         Raises:
-            InputError: for a file that is missing or no whole image, or an array of another kind.
+            InputError: for a file that is missing or no whole image, or an array of another kind; for an image that
+                does not hold the network's crop; and, where there is a map alone, for a camera that is unknown or
+                cannot be.
         """
         rgb = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
         start = time.perf_counter()
-        said = self._session.run(None, {self._session.get_inputs()[0].name: self._fed(rgb)})
-        taken_s, (position_m, quaternion, *uncertainty) = time.perf_counter() - start, (each[0] for each in said)
-        return Localisation(position_m, quaternion, taken_s, *map(float, uncertainty))
+        network = None if self._network is None else self._network.localise(rgb)
+        in_map = self._localise_in_map(rgb, intrinsics, network)
+        answer = network if in_map is None else combined(network, in_map)
+        assert answer is not None  # one of the two is there
+        return replace(answer, latency_s=time.perf_counter() - start)
 
-    def localise_each(self, source: str | Path | Iterable[SourceFrame]) -> Iterator[tuple[float, Localisation]]:
+    def localise_each(
+        self, source: str | Path | Iterable[SourceFrame], intrinsics: ArrayLike | None = None
+    ) -> Iterator[tuple[float, Localisation]]:
         """Localise a source's frames one after another, each with its time in seconds since the first.
 
         Args:
             source: as :func:`~mambaloc.runtime.sources.frames_of` takes it, or the frames that it gives.
+            intrinsics: of every frame, as :meth:`localise` takes them.
 
         Raises:
-            InputError: where there is no such source, or a frame cannot be localised.
+            InputError: where there is no such source, or as :meth:`localise`.
         """
         for frame in frames_of(source)[0] if isinstance(source, str | Path) else source:
-            yield frame.time_s, self.localise(frame.image)
+            yield frame.time_s, self.localise(frame.image, intrinsics)
 
-    def _check_input(self) -> None:
-        """The metadata and the graph may come from two hands."""
-        outputs = [output.name for output in self._session.get_outputs()]
-        if outputs != list(self.contract.outputs):
-            raise InputError(f"{self.path}: says {outputs}, as its contract does not; export it anew")
-        told, given = self.contract.preprocessing, self._session.get_inputs()[0]
-        expected = ("tensor(uint8)", [3]) if told.in_model else ("tensor(float)", [3, *told.crop])
-        if (given.type, given.shape[-len(expected[1]) :]) != expected:
-            raise InputError(
-                f"{self.path}: takes {given.type} {given.shape}, as its contract does not say; export it anew"
-            )
-
-    def _fed(self, rgb: Image) -> NDArray[np.generic]:
-        preprocessing = self.contract.preprocessing
-        size = resized_size(rgb.shape[:2], preprocessing.short_side)
-        if size[0] < preprocessing.crop[0] or size[1] < preprocessing.crop[1]:
-            given, needed = (f"{width}x{height}" for height, width in (rgb.shape[:2], preprocessing.crop))
-            raise InputError(
-                f"image of {given}: resized to short side {preprocessing.short_side} it does not hold the model's crop "
-                f"of {needed}; give frames shaped as in training"
-            )
-        if preprocessing.in_model:
-            return np.ascontiguousarray(rgb)
-        return (preprocessing.apply(rgb).transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32)
+    def _localise_in_map(
+        self, rgb: Image, intrinsics: ArrayLike | None, network: Localisation | None
+    ) -> MapLocalisation | None:
+        if self._map is None:
+            return None
+        if network is None:
+            return self._map.localise(rgb, intrinsics)
+        prior = CameraPose(matrix_from_quaternion(network.quaternion), network.position_m)
+        try:
+            return self._map.localise(rgb, intrinsics, prior)
+        except InputError as error:
+            warnings.warn(f"{error} The network answers without the map.", InputWarning, stacklevel=3)
+            return None
 
 
 def _model_file(path: Path) -> Path:
-    if path.is_dir():
-        found = [path / name for name in MODEL_FILES.values() if (path / name).is_file()]
-        if not found:
-            raise InputError(
-                f"{path}: holds none of {', '.join(MODEL_FILES.values())}; give a bundle of tools/export.py"
-            )
-        return found[0]
-    if not path.is_file():
-        raise InputError(f"{path}: no such model; tools/export.py writes them")
-    return path
+    if not path.is_dir():
+        return path
+    found = [path / name for name in MODEL_FILES.values() if (path / name).is_file()]
+    if not found:
+        raise InputError(f"{path}: holds none of {', '.join(MODEL_FILES.values())}; give a bundle of tools/export.py")
+    return found[0]
+
+
+def _map_beside(model: Path, given: SparseMap | str | Path | bool) -> SparseMap | None:
+    if isinstance(given, SparseMap):
+        return given
+    if not isinstance(given, bool):
+        return SparseMap.load(Path(given))
+    path = model / MAP_FILE
+    if not given or not path.is_file():
+        return None
+    try:
+        return SparseMap.load(path)
+    except InputError as error:
+        warnings.warn(f"{error} The network answers without the map.", InputWarning, stacklevel=3)
+        return None

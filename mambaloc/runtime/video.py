@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from rich.progress import track
 
 from mambaloc.errors import InputError
-from mambaloc.runtime.localiser import Localisation, Localiser
+from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.localiser import Localiser
 from mambaloc.runtime.pose_filter import PoseFilter, smooth
 from mambaloc.runtime.sources import frames_of
 from mambaloc.runtime.trajectory import write_tum
@@ -26,72 +27,113 @@ class Followed:
     """What became of a source's frames.
 
     Args:
-        count: of the frames.
-        outliers: of them, those whose poses a filter left out.
+        scene: the place.
+        count: frames that were localised.
+        lost: frames without a pose, as a map alone may leave.
+        from_map: of the poses, those that the map found; None unless it stands beside a network.
+        outliers: of the poses, those that a filter left out; None where there was no filter.
         latency_ms: median of a frame.
-        unfamiliar: of them, those that do not look like the place; none where the model cannot tell.
-        radii: medians of what nine of ten poses are within, in metres and degrees, where the model tells.
+        unfamiliar: of the frames, those that do not look like the place; none where that cannot be said.
+        radii: medians of what nine of ten poses are within, in metres and degrees, where that can be said.
     """
 
+    scene: str
     count: int
-    outliers: int
+    lost: int
+    from_map: int | None
+    outliers: int | None
     latency_ms: float
     unfamiliar: int = 0
     radii: tuple[float, float] | None = None
 
+    def __str__(self) -> str:
+        """As a tool prints it: one line, and another where it can be said how far off poses are."""
+        details = [] if self.outliers is None else [f"{self.outliers} outliers"]
+        if self.from_map is not None:
+            details += [f"{self.from_map} from the map, {self.count - self.from_map} from the network"]
+        if self.lost:
+            details += [f"{self.lost} frames without a pose"]
+        poses = f"{self.count} poses" + (f" ({', '.join(details)})" if details else "")
+        line = f"{poses} in {self.scene}, median {self.latency_ms:.1f} ms a frame"
+        if self.radii is None:
+            return line
+        metres, degrees = self.radii
+        unfamiliar = f"; {self.unfamiliar} do not look like the place" if self.unfamiliar else ""
+        return f"{line}\nnine of ten within {metres:.2g} m and {degrees:.2g}°{unfamiliar}"
 
-def follow(localiser: Localiser, source: str, out: Path, filtering: str | None = None) -> Followed:
+
+def follow(
+    localiser: Localiser,
+    source: str,
+    out: Path,
+    filtering: str | None = None,
+    intrinsics: ArrayLike | None = None,
+) -> Followed:
     """Localise every frame of a source with a progress bar on stderr, and write a TUM trajectory.
 
     Ctrl-C ends it; what was found is written then, and also where a frame cannot be localised. The trajectory's times
-    are those that the filter takes: seconds since the first frame.
+    are those that the filter takes: seconds since the first frame. It leaves out frames without a pose.
 
     Args:
         localiser: of the model.
         source: as :func:`~mambaloc.runtime.sources.frames_of` takes it.
         out: the trajectory.
         filtering: one of :data:`FILTERS`; poses are written as found unless given.
+        intrinsics: of every frame, (3, 3) in pixels, for the map; the map's own camera unless given.
 
     Raises:
-        InputError: where there is no such source, it holds no frame, one cannot be localised, or ``out`` has no folder.
+        InputError: where there is no such source, it holds no frame, one cannot be localised, none has a pose, or
+            ``out`` has no folder.
     """
     if out.is_dir() or not out.absolute().parent.is_dir():
         raise InputError(f"--out {out}: there is no folder to write that file to; make it, or choose another")
     frames, count = frames_of(source)
     console = Console(stderr=True)
     found: list[tuple[float, Localisation]] = []
-    outliers = 0
+    kept: list[tuple[float, Localisation]] = []
+    outliers = None
     try:
         watched = track(frames, "Localising", count, console=console, transient=True)
-        for time_s, pose in localiser.localise_each(watched):
+        for time_s, pose in localiser.localise_each(watched, intrinsics):
             found.append((time_s, pose))  # at once, so that Ctrl-C leaves as many times as poses
     except KeyboardInterrupt:
         pass
     finally:
-        if found:
-            times_s, poses = zip(*found, strict=True)
+        kept = [each for each in found if each[1].source is not None]
+        if kept:
+            times_s, poses = zip(*kept, strict=True)
             with console.status("Filtering"):
                 positions_m, quaternions, outliers = _filtered(filtering, times_s, poses)
             write_tum(out, times_s, positions_m, quaternions)
     if not found:
         raise InputError(f"{source}: holds no frame; give another video")
-    latency_ms, unfamiliar = 1000 * _median(poses, "latency_s"), sum(pose.is_unfamiliar for pose in poses)
-    tells = localiser.contract.uncertainty is not None
-    radii = (_median(poses, "position_radius_m"), _median(poses, "rotation_radius_deg")) if tells else None
-    return Followed(len(found), outliers, latency_ms, unfamiliar, radii)
+    if not kept:
+        raise InputError(f"{source}: none of its {len(found)} frames was localised. Give frames of the map's place.")
+    has_both = localiser.contract is not None and localiser.sparse_map is not None
+    return Followed(
+        localiser.scene,
+        len(poses),
+        len(found) - len(poses),
+        sum(pose.source == "map" for pose in poses) if has_both else None,
+        outliers,
+        1000 * float(np.median([pose.latency_s for _, pose in found])),
+        sum(pose.is_unfamiliar for pose in poses),
+        _median_radii(poses),
+    )
 
 
-def _median(poses: Sequence[Localisation], of: str) -> float:
-    return float(np.median([getattr(pose, of) for pose in poses]))
+def _median_radii(poses: Sequence[Localisation]) -> tuple[float, float] | None:
+    radii = [(pose.position_radius_m, pose.rotation_radius_deg) for pose in poses if pose.position_radius_m is not None]
+    return tuple(np.median(np.array(radii, np.float64), axis=0).tolist()) if radii else None
 
 
 def _filtered(
     filtering: str | None, times_s: Sequence[float], poses: Sequence[Localisation]
-) -> tuple[NDArray[np.floating], NDArray[np.floating], int]:
-    """Positions (N, 3), quaternions (N, 4), and how many were left out."""
+) -> tuple[NDArray[np.floating], NDArray[np.floating], int | None]:
+    """Positions (N, 3), quaternions (N, 4), and how many were left out, by a filter."""
     positions_m, quaternions = (np.stack([getattr(pose, of) for pose in poses]) for of in ("position_m", "quaternion"))
     if filtering is None:
-        return positions_m, quaternions, 0
+        return positions_m, quaternions, None
     if filtering == "smooth":
         estimates = smooth(times_s, positions_m, quaternions)
     else:

@@ -9,6 +9,7 @@ import logging
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from filelock import FileLock, Timeout
 
@@ -28,6 +30,7 @@ from mambaloc.sweep.store import Store
 from mambaloc.sweep.trials import Sweep, Trial
 
 TRAIN = (sys.executable, "-m", "mambaloc.cli")
+_CONNECT_S = 10
 _SUPERVISOR = Path(__file__).with_name("supervised.py")
 
 
@@ -196,6 +199,8 @@ def _pool(sweep: Sweep, address: str | None) -> Iterator[Submit]:
         return
     import ray
 
+    if address is not None and ":" in address:
+        _check_answers(address)  # Ray itself tries for minutes
     logging.getLogger("ray").setLevel(logging.ERROR)  # of itself it speaks of tokens and addresses
     try:
         ray.init(address=address, log_to_driver=False, include_dashboard=False, configure_logging=False)
@@ -210,3 +215,12 @@ def _pool(sweep: Sweep, address: str | None) -> Iterator[Submit]:
         yield lambda *arguments: remote.remote(*arguments).future()
     finally:
         ray.shutdown()
+
+
+def _check_answers(address: str) -> None:
+    """Refuse a Ray cluster's ``HOST:PORT``, or ``ray://HOST:PORT``, where nothing listens."""
+    parts = urlsplit(address if "//" in address else f"//{address}")
+    try:
+        socket.create_connection((parts.hostname or "", parts.port or 6379), _CONNECT_S).close()
+    except (OSError, ValueError) as error:
+        raise InputError(f"--address {address}: no Ray cluster answers there ({error}). Start one.") from None

@@ -8,14 +8,21 @@ from pathlib import Path
 
 from mambaloc.data import PoseDataModule
 from mambaloc.export import write_bundle
+from mambaloc.mapping import MapSettings, build_map
+from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.runtime import contract
+from mambaloc.runtime.maps import MAP_FILE, sparse_map
 from mambaloc.user_cache import made_once
-from mambaloc.zoo.loading import is_checkpoint, load, released_folder
+from mambaloc.zoo.loading import is_checkpoint, load, released_folder, released_map
 from mambaloc.zoo.manifest import MANIFEST_FILE, Manifest
 
 EMBEDDED = "student.embedded_room"
 """The released model that comes with the package."""
+
+_EMBEDDED_SCENE = "embedded/room"
+_EMBEDDED_MAP = MapSettings(key_frames=80, width=160)
 
 
 def load_with_data(source: str, root: str | None = None) -> tuple[LitPoseRegressor, PoseDataModule]:
@@ -39,6 +46,34 @@ def load_with_data(source: str, root: str | None = None) -> tuple[LitPoseRegress
     return system, data
 
 
+def map_of(source: str) -> Path | None:
+    """The sparse map of a trained system: its run's ``map/map.safetensors``, or the one released with it.
+
+    The embedded room's, whose frames are rendered here, is built in the user's cache on first use (seconds).
+
+    Args:
+        source: as :func:`mambaloc.load` takes it.
+
+    Returns:
+        The file; None where there is none.
+
+    Raises:
+        InputError: where there is no released model of this name, or its map is not the file that was released.
+    """
+    if is_checkpoint(source):
+        beside = Path(source).parent.parent / "map" / MAP_FILE
+        return beside if beside.is_file() else None
+    folder = released_folder(source)
+    if (path := released_map(folder)) is not None or Manifest.read(folder).scene != _EMBEDDED_SCENE:
+        return path
+    return made_once(f"maps/embedded_room-{_versions()}", _build_embedded_map) / MAP_FILE
+
+
+def _build_embedded_map(folder: Path) -> None:
+    dataset, scene = _EMBEDDED_SCENE.split("/")
+    build_map(read_frames(MapRecipe(scene, dataset), "train"), _EMBEDDED_MAP, scene).save(folder / MAP_FILE)
+
+
 def released_bundle(name: str = EMBEDDED) -> Path:
     """The bundle of a released model, exported into the user's cache on first use (half a minute).
 
@@ -47,9 +82,13 @@ def released_bundle(name: str = EMBEDDED) -> Path:
     """
     folder = released_folder(name)
     manifest, content = Manifest.read(folder), (folder / MANIFEST_FILE).read_bytes()
-    digest = hashlib.sha256(f"{contract.VERSION}{version('mambaloc')}".encode() + content).hexdigest()[:16]
+    digest = hashlib.sha256(_versions().encode() + content).hexdigest()[:16]
 
     def make(partial: Path) -> None:
-        write_bundle(*load_with_data(name), partial / "bundle", ("onnx",), target="pc")
+        write_bundle(*load_with_data(name), partial / "bundle", ("onnx",), target="pc", sparse_map=map_of(name))
 
     return made_once(f"bundles/{manifest.model}-{digest}", make) / "bundle"
+
+
+def _versions() -> str:
+    return f"{version('mambaloc')}-{contract.VERSION}-{sparse_map.VERSION}"

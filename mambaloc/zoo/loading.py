@@ -14,6 +14,7 @@ from safetensors.torch import load as tensors_of
 
 from mambaloc.errors import InputError
 from mambaloc.models import Checkpoint, LitPoseRegressor, create_model
+from mambaloc.runtime.maps import MAP_FILE
 from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest
 
 _ZOOS = (Path(__file__).parents[2] / "zoo", Path(sys.prefix) / "share/mambaloc/zoo")
@@ -72,12 +73,7 @@ def load_released(folder: Path) -> LitPoseRegressor:
         InputError: as :func:`load`.
     """
     manifest, path = Manifest.read(folder), folder / WEIGHTS_FILE
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); get the model anew") from None
-    if hashlib.sha256(content).hexdigest() != manifest.weights_sha256:
-        raise InputError(f"{path}: is not the file that its manifest speaks of (sha256 differs); get the model anew")
+    content = _released_bytes(path, manifest.weights_sha256)
     try:
         system = create_model(manifest.model, **{**manifest.arguments, "backbone_weights": None, "warm_start": None})
         system.network.load_state_dict(tensors_of(content))
@@ -88,11 +84,34 @@ def load_released(folder: Path) -> LitPoseRegressor:
     return system.eval()
 
 
+def released_map(folder: Path) -> Path | None:
+    """The sparse map that was released with a model, its digest checked; None where there is none.
+
+    Raises:
+        InputError: where the manifest is wrong, or the file is missing or another.
+    """
+    digest, path = Manifest.read(folder).map_sha256, folder / MAP_FILE
+    if digest is None:
+        return None
+    _released_bytes(path, digest)
+    return path
+
+
+def _released_bytes(path: Path, digest: str) -> bytes:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); get the model anew") from None
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise InputError(f"{path}: is not the file that its manifest speaks of (sha256 differs); get the model anew")
+    return content
+
+
 def _from_hub(name: str) -> Path:
     repository, at, revision = name.partition("@")
     if not at or not revision:
         raise InputError(f"hf-hub:{name}: names no revision, so it may change; give hf-hub:{repository}@REVISION")
-    files = [MANIFEST_FILE, WEIGHTS_FILE]
+    files = [MANIFEST_FILE, WEIGHTS_FILE, MAP_FILE]
     try:
         return Path(snapshot_download(repository, revision=revision, allow_patterns=files))
     except Exception as online:  # the hub's client raises its own errors, its transport's, and the system's

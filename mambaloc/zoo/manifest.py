@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,8 @@ class Manifest:
         trained: commit, seed, device and versions of the training, and its recipe's digest.
         results: measured errors.
         licence: of the weights.
+        map_sha256: digest of ``map.safetensors``; None where there is no sparse map.
+        map_bytes: its size.
     """
 
     model: str
@@ -74,10 +76,13 @@ class Manifest:
     trained: dict[str, Any]
     results: tuple[Result, ...]
     licence: str
+    map_sha256: str | None = None
+    map_bytes: int | None = None
 
     def to_yaml(self) -> str:
-        """Write it down."""
-        data = {"manifest": VERSION, **asdict(self), "results": [asdict(result) for result in self.results]}
+        """Write it down, without what is None."""
+        known = {name: value for name, value in asdict(self).items() if value is not None}
+        data = {"manifest": VERSION, **known, "results": [asdict(result) for result in self.results]}
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=120)
 
     @classmethod
@@ -98,7 +103,9 @@ class Manifest:
 
 _KINDS: dict[str, Any] = {
     "str": str,
+    "str | None": str,
     "int": int,
+    "int | None": int,
     "float": (int, float),
     "bool": bool,
     "dict[str, Any]": dict,
@@ -114,13 +121,14 @@ def _checked_result(path: Path, number: int, entry: Any) -> Result:
 
 
 def _check(path: Path, what: str, data: dict[str, Any], kind: type) -> None:
-    """Every field there, of its type and not empty, and no other."""
+    """Every field there, unless it may be None, of its type and not empty, and no other."""
     expected = {field.name: _KINDS[str(field.type)] for field in fields(kind)}
-    if missing := [name for name in expected if data.get(name) in (None, "")]:
+    needed = [field.name for field in fields(kind) if field.default is MISSING]
+    if missing := [name for name in needed if data.get(name) in (None, "")]:
         raise InputError(f"{path}: {what} lacks {', '.join(missing)}; nothing is told without where it came from")
     if unknown := sorted(set(map(str, data)) - set(expected)):
         raise InputError(f"{path}: {what} has {', '.join(unknown)}, which no manifest has; publish the model anew")
-    for name, types in expected.items():
-        value = data[name]
+    for name, value in data.items():
+        types = expected[name]
         if not isinstance(value, types) or (isinstance(value, bool) and types is not bool):
             raise InputError(f"{path}: {what}'s {name} is {value!r}; publish the model anew")

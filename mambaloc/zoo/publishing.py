@@ -6,6 +6,7 @@ import hashlib
 import inspect
 import json
 import re
+import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,12 +18,15 @@ from mambaloc.data.datasets.registry import licence_of_weights
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint
 from mambaloc.evaluation.predict import localise_test_frames
-from mambaloc.files import whole_folder
+from mambaloc.export.maps import check_scene
+from mambaloc.files import sha256, whole_folder
 from mambaloc.metrics import summarise
 from mambaloc.models import Checkpoint
 from mambaloc.models.registry import model_class
 from mambaloc.runtime.contract import POSE
+from mambaloc.runtime.maps import MAP_FILE, SparseMap
 from mambaloc.types import height_and_width
+from mambaloc.zoo.bundles import map_of
 from mambaloc.zoo.loading import load_released
 from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest, Result
 
@@ -43,7 +47,8 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
         The model's folder; it appears once both measurements agree.
 
     Raises:
-        InputError: for a bad name, a name that is taken, a result without provenance, or measurements that differ.
+        InputError: for a bad name, a name that is taken, a result without provenance, a run's map that is damaged or of
+            another scene, or measurements that differ.
     """
     checkpoint = Checkpoint.read(path)
     folder = zoo / f"{checkpoint.provenance['model']}.{tag}"
@@ -55,6 +60,10 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
     with TemporaryDirectory() as scratch:
         measured = evaluate_checkpoint(checkpoint, Path(scratch), data, accelerator)
     with whole_folder(folder, "choose another --zoo") as partial:
+        sparse_map = map_of(str(path))
+        if sparse_map is not None:
+            check_scene(sparse_map, SparseMap.load(sparse_map), data)
+            shutil.copyfile(sparse_map, partial / MAP_FILE)
         weights = save({name: tensor.contiguous().cpu() for name, tensor in system.network.state_dict().items()})
         manifest = Manifest(
             model=system.registry_name,
@@ -69,6 +78,8 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
             trained=_plain({**checkpoint.provenance, "recipe_sha256": measured["training"]["recipe_sha256"]}),
             results=(_result(measured),),
             licence=licence_of_weights(data.hparams["dataset"]),
+            map_sha256=None if sparse_map is None else sha256(partial / MAP_FILE),
+            map_bytes=None if sparse_map is None else (partial / MAP_FILE).stat().st_size,
         )
         (partial / WEIGHTS_FILE).write_bytes(weights)
         (partial / MANIFEST_FILE).write_text(manifest.to_yaml(), encoding="utf-8")
@@ -93,7 +104,7 @@ def card(name: str, manifest: Manifest) -> str:
 `mambaloc.load("{name}")`: {manifest.model}, which knows the scene {manifest.scene} and no other.
 
 {manifest.pose}. Images are resized to a short side of {manifest.short_side} pixels and cropped in the middle to
-{width}x{height}. {manifest.weights_bytes / 2**20:.2f} MiB, float32.
+{width}x{height}. {manifest.weights_bytes / 2**20:.2f} MiB, float32.{_map(manifest)}
 
 | data | epoch | median position | median rotation | seed | training | device | commit |
 |---|---|---|---|---|---|---|---|
@@ -113,6 +124,12 @@ Here with the backbone {manifest.arguments["backbone"]}, GIS: {manifest.argument
 
 {manifest.licence}
 """
+
+
+def _map(manifest: Manifest) -> str:
+    if manifest.map_bytes is None:
+        return ""
+    return f" Beside them a sparse map, {manifest.map_bytes / 2**20:.2f} MiB, which a bundle carries."
 
 
 def _result(measured: dict[str, Any]) -> Result:

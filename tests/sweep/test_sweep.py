@@ -1,6 +1,7 @@
 """Sweeps: what their trials are, and that every trial runs once, whatever happens meanwhile."""
 
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -249,6 +250,16 @@ def test_a_store_that_is_none(folder):
 def test_an_address_needs_ray(folder):
     with pytest.raises(InputError, match=r"pip install 'mambaloc\[cluster\]'"):
         run_sweep(six(folder), folder / "out", address="1.2.3.4:6379")
+
+
+def test_an_address_where_nothing_listens_is_refused_at_once():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        running._check_answers(address)
+        running._check_answers(f"ray://{address}")
+    for gone in (address, f"ray://{address}", "127.0.0.1:x"):
+        with pytest.raises(InputError, match=rf"--address {gone}: no Ray cluster answers there"):
+            running._check_answers(gone)
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from rich.progress import track
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process, peak_bytes
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import exits_cleanly, quieten, whole_number
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.registry import DATASETS, scene_folder
 from mambaloc.data.frames import BadFrames, Split
@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("root", type=Path, help="folder that holds them")
     parser.add_argument("scenes", nargs="*", help="names; every official one that is there unless given")
     parser.add_argument("--dataset", default="7scenes")
-    parser.add_argument("--short-side", type=int, default=256, help="what images are resized to, in pixels")
+    parser.add_argument("--short-side", type=whole_number(1), default=256, help="what images are resized to, in pixels")
     args = parser.parse_args()
     print_scenes(measure_scenes(args.dataset, args.root, args.scenes, args.short_side), provenance.machine())
 

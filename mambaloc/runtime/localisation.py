@@ -1,0 +1,80 @@
+"""What a localiser answers, and which answer counts where there are two."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.runtime.maps import MapLocalisation
+from mambaloc.runtime.maps.radii import covariance_radius
+
+Floats = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Where one image was taken: ``world_from_cam``.
+
+    Shape:
+        ``position_m`` (3,) camera centre in metres; ``quaternion`` (4,) unit, wxyz, ``w >= 0``; both NaN where there is
+        no pose. ``covariance`` (6, 6).
+
+    Args:
+        position_m: in the scene's frame.
+        quaternion: of the same pose.
+        latency_s: seconds that it took, without decoding the image.
+        position_radius_m: nine of ten poses are within this, as the model's contract says, or the covariance where the
+            map answers; None where the network answers and its model does not tell.
+        rotation_radius_deg: the same of the rotation.
+        unfamiliarity: how far the image is from those that the network was trained on; over 1, hardly any frame of the
+            place is. None where the model does not tell.
+        source: what found the pose; None where nothing did.
+        inliers: matches that agree with the map's pose, accepted or not; None where there is no map.
+        covariance: where the map answers, of the position in metres, then of the rotation in radians about the fixed
+            axes of the world, as ROS's PoseWithCovariance has it.
+    """
+
+    position_m: Floats
+    quaternion: Floats
+    latency_s: float
+    position_radius_m: float | None = None
+    rotation_radius_deg: float | None = None
+    unfamiliarity: float | None = None
+    source: Literal["network", "map"] | None = "network"
+    inliers: int | None = None
+    covariance: Floats | None = None
+
+    @property
+    def is_unfamiliar(self) -> bool:
+        """Whether the image does not look like the place, so that the network's pose says nothing.
+
+        False where the map answers, and where none can tell.
+        """
+        return self.source != "map" and self.unfamiliarity is not None and not self.unfamiliarity <= 1
+
+
+def combined(network: Localisation | None, found: MapLocalisation) -> Localisation:
+    """The map's pose where it is accepted, otherwise the network's, otherwise none.
+
+    Everything that has both a network and a map decides here: apps' runtime, evaluation and benchmarks.
+
+    Args:
+        network: its answer; None where there is no network.
+        found: the map's answer about the same image.
+    """
+    lost = Localisation(np.full(3, np.nan), np.full(4, np.nan), 0.0, source=None)
+    base = replace(network or lost, inliers=found.inliers)
+    if not found.is_accepted:
+        return base
+    return replace(
+        base,
+        position_m=found.position_m,
+        quaternion=found.quaternion,
+        position_radius_m=covariance_radius(found.covariance[:3, :3]),
+        rotation_radius_deg=float(np.degrees(covariance_radius(found.covariance[3:, 3:]))),
+        source="map",
+        covariance=found.covariance,
+    )

@@ -1,0 +1,82 @@
+"""Poses from images with an exported network."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.images import Image, resized_size
+from mambaloc.runtime.contract import METADATA_KEY, Contract
+from mambaloc.runtime.localisation import Localisation
+
+
+class Network:
+    """A network on ONNX Runtime.
+
+    Args:
+        path: an ``.onnx`` or ``.ort`` file that ``tools/export.py`` wrote.
+        threads: that one image may use; ONNX Runtime's choice unless given.
+
+    Raises:
+        InputError: where there is no such model, it cannot be run, or it carries no contract.
+    """
+
+    def __init__(self, path: Path, threads: int | None = None) -> None:
+        if not path.is_file():
+            raise InputError(f"{path}: no such model; tools/export.py writes them")
+        self.path = path
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        options.intra_op_num_threads = threads or 0
+        try:
+            self._session = onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime's own exceptions share no base
+            reason = str(error).splitlines()[0]
+            raise InputError(f"{self.path}: ONNX Runtime cannot load it ({reason}); export it anew") from None
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if METADATA_KEY not in metadata:
+            raise InputError(f"{self.path}: carries no contract of its input; export it with tools/export.py")
+        self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
+        self._check_input()
+
+    def localise(self, rgb: Image) -> Localisation:
+        """Localise an RGB image (H, W, 3), ``uint8``.
+
+        Raises:
+            InputError: for an image that does not hold the crop that the network takes.
+        """
+        start = time.perf_counter()
+        said = self._session.run(None, {self._session.get_inputs()[0].name: self._fed(rgb)})
+        taken_s, (position_m, quaternion, *uncertainty) = time.perf_counter() - start, (each[0] for each in said)
+        radius_m, radius_deg, unfamiliarity = map(float, uncertainty) if uncertainty else (None, None, None)
+        return Localisation(position_m, quaternion, taken_s, radius_m, radius_deg, unfamiliarity)
+
+    def _check_input(self) -> None:
+        """The metadata and the graph may come from two hands."""
+        outputs = [output.name for output in self._session.get_outputs()]
+        if outputs != list(self.contract.outputs):
+            raise InputError(f"{self.path}: says {outputs}, as its contract does not; export it anew")
+        told, given = self.contract.preprocessing, self._session.get_inputs()[0]
+        expected = ("tensor(uint8)", [3]) if told.in_model else ("tensor(float)", [3, *told.crop])
+        if (given.type, given.shape[-len(expected[1]) :]) != expected:
+            raise InputError(
+                f"{self.path}: takes {given.type} {given.shape}, as its contract does not say; export it anew"
+            )
+
+    def _fed(self, rgb: Image) -> NDArray[np.generic]:
+        preprocessing = self.contract.preprocessing
+        size = resized_size(rgb.shape[:2], preprocessing.short_side)
+        if size[0] < preprocessing.crop[0] or size[1] < preprocessing.crop[1]:
+            given, needed = (f"{width}x{height}" for height, width in (rgb.shape[:2], preprocessing.crop))
+            raise InputError(
+                f"image of {given}: resized to short side {preprocessing.short_side} it does not hold the model's crop "
+                f"of {needed}; give frames shaped as in training"
+            )
+        if preprocessing.in_model:
+            return np.ascontiguousarray(rgb)
+        return (preprocessing.apply(rgb).transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32)
