@@ -63,6 +63,14 @@ class MapErrors:
             "query_cpu_ms": float(1000 * self.cpu_s.mean()),
         }
 
+    def describe(self) -> str:
+        """In one line."""
+        summary = self.summary()
+        return (
+            f"median {summary['position_error_m']:.3f} m / {summary['rotation_error_deg']:.2f} deg, "
+            f"{100 * summary['recall_10cm_5deg']:.1f} % within 10 cm 5 deg, {100 * summary['accepted']:.1f} % accepted"
+        )
+
     def _within(self, position_m: float, rotation_deg: float) -> NDArray[np.bool_]:
         return (self.position_m <= position_m) & (self.rotation_deg <= rotation_deg)
 

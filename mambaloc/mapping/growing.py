@@ -11,24 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.mapping.building import epipolar_px, keypoint_tracks, points_of_tracks
-from mambaloc.mapping.bundle_adjustment import Prior, adjust
+from mambaloc.mapping.extending import extend
 from mambaloc.mapping.keyframes import farthest_first
-from mambaloc.mapping.pairs import pairs_by_pose
-from mambaloc.mapping.tracks import match_pair
-from mambaloc.mapping.triangulation import Observations, residuals, triangulate
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
 from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.viewpoints import spread_m
 from mambaloc.runtime.rotations import matrix_from_quaternion
 
 Floats = NDArray[np.floating[Any]]
-Indices = NDArray[np.int64]
 
+_MOST_NAMED = 8
 _FARTHEST, _FARTHEST_DEG = 0.25, 15.0  # of the key frames' spread; by how much a given pose may be off
-_LEAST_AGREEING = 0.3  # of matches between new frames
-_WIDTHS = (1,)
-_GIVEN_DEG = 1.0  # deviation of given poses
 
 
 @dataclass(frozen=True)
@@ -62,6 +55,17 @@ class Growth:
     lost: list[str]
     rounds: int
 
+    def describe(self, points_before: int) -> str:
+        """One line, and one with the names of lost frames where there are any."""
+        text = (
+            f"{len(self.key_frames)} key frames and {len(self.sparse_map) - points_before} points added, "
+            f"in {self.rounds} rounds; {len(self.sparse_map)} points in all"
+        )
+        if self.lost:
+            more = f" and {len(self.lost) - _MOST_NAMED} more" if len(self.lost) > _MOST_NAMED else ""
+            text += f"\nnot found in the map: {len(self.lost)} frames, {', '.join(self.lost[:_MOST_NAMED])}{more}"
+        return text
+
 
 def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, most: int) -> Growth:
     """Localise frames in a map, make key frames of those found, and triangulate what these add.
@@ -82,7 +86,8 @@ def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, 
     if session in sparse_map.sessions:
         raise InputError(f"{session}: was added before. Remove that first, or add these under another --name.")
     poses: dict[int, CameraPose] = {}
-    grown, key, rounds, contradict = sparse_map, [], 0, 0
+    grown, rounds, contradict = sparse_map, 0, 0
+    key: list[int] = []
     while True:
         found, contradict = _found(grown, frames, [row for row in range(len(frames)) if row not in poses])
         rounds += 1
@@ -94,6 +99,34 @@ def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, 
         raise InputError(_why_none(session, len(frames), contradict))
     lost = [frame.name for row, frame in enumerate(frames) if row not in poses]
     return Growth(grown, [frames[row].name for row in key], lost, rounds)
+
+
+def remove_session(sparse_map: SparseMap, session: str) -> SparseMap:
+    """Remove the key frames that were added under a name, and the points that no other key frame sees.
+
+    Where nothing was added since, this is the map as it was before, bit for bit.
+
+    Raises:
+        InputError: where the map has no such session.
+    """
+    if session not in sparse_map.sessions:
+        added = ", ".join(sparse_map.sessions) or "nothing"
+        raise InputError(f"{session}: was never added to the map of {sparse_map.scene}. What was added: {added}.")
+    names = list(sparse_map.sessions)
+    later = sum(sparse_map.sessions[name] for name in names[names.index(session) + 1 :])
+    end = len(sparse_map.key_poses) - later
+    gone = np.arange(end - sparse_map.sessions[session], end)
+    is_seen = np.delete(sparse_map.is_seen, gone, axis=1)
+    kept = is_seen.any(axis=1)
+    return replace(
+        sparse_map,
+        points_m=sparse_map.points_m[kept],
+        descriptors=sparse_map.descriptors[kept],
+        views=np.packbits(is_seen[kept], axis=1),
+        key_poses=np.delete(sparse_map.key_poses, gone, axis=0),
+        digests=_without(sparse_map.digests, session),
+        sessions=_without(sparse_map.sessions, session),
+    )
 
 
 def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -> tuple[dict[int, CameraPose], int]:
@@ -112,120 +145,33 @@ def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -
     return found, contradict
 
 
-def remove_session(sparse_map: SparseMap, session: str) -> SparseMap:
-    """Remove the key frames that were added under a name, and the points that no other key frame sees.
-
-    Where nothing was added since, this is the map as it was before, bit for bit.
-
-    Raises:
-        InputError: where the map has no such session.
-    """
-    if session not in sparse_map.sessions:
-        names = ", ".join(sparse_map.sessions) or "nothing"
-        raise InputError(f"{session}: was never added to the map of {sparse_map.scene}. What was added: {names}.")
-    names = list(sparse_map.sessions)
-    later = sum(sparse_map.sessions[name] for name in names[names.index(session) + 1 :])
-    end = len(sparse_map.key_poses) - later
-    gone = np.arange(end - sparse_map.sessions[session], end)
-    is_seen = np.delete(sparse_map.is_seen, gone, axis=1)
-    kept = is_seen.any(axis=1)
-    return replace(
-        sparse_map,
-        points_m=sparse_map.points_m[kept],
-        descriptors=sparse_map.descriptors[kept],
-        views=np.packbits(is_seen[kept], axis=1),
-        key_poses=np.delete(sparse_map.key_poses, gone, axis=0),
-        digests=_without(sparse_map.digests, session),
-        sessions=_without(sparse_map.sessions, session),
-    )
-
-
 def _grown(
     sparse_map: SparseMap, frames: Sequence[NewFrame], poses: dict[int, CameraPose], session: str, most: int
 ) -> tuple[SparseMap, list[int]]:
     """The map with frames whose poses are known, and which became key frames; their poses are adjusted in place."""
     rows = np.array(sorted(poses))
     key = rows[farthest_first(np.stack([poses[row].matrix for row in rows]), most)].tolist()
-    new = [frames[row] for row in key]
-    localiser = MapLocaliser(sparse_map)
-    for width in _WIDTHS:
-        seen, _, _, known, cam_from_world = _seen(localiser, new, [poses[row] for row in key], width)
-        adjusted = np.linalg.inv(_adjusted(sparse_map, new, known, cam_from_world, seen))
-        poses |= {row: CameraPose(pose[:3, :3], pose[:3, 3]) for row, pose in zip(key, adjusted, strict=True)}
-    seen, keypoint, rest, known, cam_from_world = _seen(localiser, new, [poses[row] for row in key], 1)
-    points_m, descriptors, seen_by_new = points_of_tracks(
-        rest, cam_from_world, seen, keypoint, np.random.default_rng(0)
+    given = [pose.matrix for row in key if (pose := frames[row].given) is not None]
+    new = extend(
+        MapLocaliser(sparse_map),
+        [frames[row].features for row in key],
+        np.stack([poses[row].matrix for row in key]),
+        np.stack(given) if len(given) == len(key) else None,
     )
-    order = np.argsort(-seen_by_new.sum(axis=1), kind="stable")
-    known_by_new = np.zeros((len(sparse_map), len(key)), bool)
-    for column, (_, points) in enumerate(known):
-        known_by_new[points, column] = True
-    old = np.concatenate((sparse_map.is_seen, known_by_new), axis=1)
-    added = np.concatenate((np.zeros((len(order), len(sparse_map.key_poses)), bool), seen_by_new[order]), axis=1)
-    world_from_cam = np.linalg.inv(cam_from_world)
+    for row, pose in zip(key, new.world_from_cam, strict=True):
+        poses[row] = CameraPose(pose[:3, :3], pose[:3, 3])
+    unseen = np.zeros((len(new.points_m), len(sparse_map.key_poses)), bool)
+    views = np.block([[sparse_map.is_seen, new.views], [unseen, new.new_views]])
     grown = replace(
         sparse_map,
-        points_m=np.concatenate((sparse_map.points_m, points_m[order].astype(np.float32))),
-        descriptors=np.concatenate((sparse_map.descriptors, quantized(descriptors[order]))),
-        views=np.packbits(np.concatenate((old, added)), axis=1),
-        key_poses=np.concatenate((sparse_map.key_poses, world_from_cam)),
-        digests={**sparse_map.digests, session: hashlib.sha256(world_from_cam.tobytes()).hexdigest()},
+        points_m=np.concatenate((sparse_map.points_m, new.points_m.astype(np.float32))),
+        descriptors=np.concatenate((sparse_map.descriptors, quantized(new.descriptors))),
+        views=np.packbits(views, axis=1),
+        key_poses=np.concatenate((sparse_map.key_poses, new.world_from_cam)),
+        digests={**sparse_map.digests, session: hashlib.sha256(new.world_from_cam.tobytes()).hexdigest()},
         sessions={**sparse_map.sessions, session: len(key)},
     )
     return grown, key
-
-
-def _seen(localiser, new, poses, width):
-    known = [localiser.matches(frame.features, pose) for frame, pose in zip(new, poses, strict=True)]
-    rest = [
-        frame.features.select(np.setdiff1d(np.arange(len(frame.features)), keypoints))
-        for frame, (keypoints, _) in zip(new, known, strict=True)
-    ]
-    cam_from_world = np.linalg.inv([pose.matrix for pose in poses])
-    seen, keypoint = _tracks(rest, cam_from_world, width * epipolar_px(localiser.map.size[0]))
-    return seen, keypoint, rest, known, cam_from_world
-
-
-def _tracks(features: Sequence[Features], cam_from_world: Floats, near: float) -> tuple[Observations, Indices]:
-    """What the frames see together; pairs whose matches mostly disagree with the poses are left out."""
-    found = [
-        (pair, *match_pair(features, cam_from_world, pair, near))
-        for pair in pairs_by_pose(np.linalg.inv(cam_from_world))
-    ]
-    agreeing = [(pair, rows) for pair, rows, tried in found if len(rows) > _LEAST_AGREEING * tried]
-    pairs = np.array([pair for pair, _ in agreeing], np.int64).reshape(-1, 2)
-    return keypoint_tracks(features, pairs, [np.empty((0, 2), np.int64), *(rows for _, rows in agreeing)][1:], near)
-
-
-def _adjusted(
-    sparse_map: SparseMap,
-    new: Sequence[NewFrame],
-    known: Sequence[tuple[Indices, Indices]],
-    cam_from_world: Floats,
-    seen: Observations,
-) -> Floats:
-    """Poses of the new frames, ``cam_from_world``, adjusted to the map's points, which stay, and to new ones."""
-    points, is_point, agrees = triangulate(cam_from_world, seen, np.random.default_rng(0))
-    used = agrees & is_point[seen.track]
-    frame = np.concatenate([seen.frame[used], *(np.full(len(rows), column) for column, (rows, _) in enumerate(known))])
-    track = np.concatenate([seen.track[used], *(len(points) + rows for _, rows in known)])
-    rays = np.concatenate(
-        [seen.rays[used], *(each.features.rays[rows] for each, (rows, _) in zip(new, known, strict=True))]
-    )
-    near = epipolar_px(sparse_map.size[0]) / sparse_map.intrinsics[0, 0]
-    order = np.argsort(track, kind="stable")
-    every = Observations(frame[order], track[order], rays[order], np.full(len(order), near))
-    places = np.concatenate((points, sparse_map.points_m))[np.unique(track)]
-    is_fixed = np.unique(track) >= len(points)
-    if all(each.given is not None for each in new):
-        given = np.linalg.inv([each.given.matrix for each in new])
-        turn = np.radians(_GIVEN_DEG)
-        prior = Prior(turn, turn * float(np.median(np.linalg.norm(places - sparse_map.key_poses[0, :3, 3], axis=1))))
-    else:
-        given, prior = cam_from_world, Prior(np.pi, 10 * spread_m(sparse_map.key_poses))
-    every = every.renumbered()
-    every = every.as_near_as(residuals(cam_from_world, every, places))
-    return adjust(cam_from_world, every, places, prior, given=given, fixed=is_fixed)[0]
 
 
 def _agree(pose: CameraPose, given: CameraPose, unit_m: float) -> bool:

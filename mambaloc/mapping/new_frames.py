@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -16,7 +17,7 @@ from mambaloc.errors import InputError
 from mambaloc.images import read_image
 from mambaloc.mapping.evaluating import read_frames
 from mambaloc.mapping.growing import NewFrame
-from mambaloc.mapping.recipe import MapRecipe, read_recipe
+from mambaloc.mapping.recipe import recipe_of
 from mambaloc.runtime.maps import CameraPose, MapLocaliser
 from mambaloc.runtime.sources import frames_of
 
@@ -52,8 +53,7 @@ def read_new_frames(
 
 
 def _posed(source: Path, localiser: MapLocaliser) -> Iterator[NewFrame]:
-    recipe = MapRecipe(str(source)) if source.is_dir() else read_recipe(source)
-    frames = read_frames(recipe, "train")
+    frames = read_frames(recipe_of(source), "train")
     for image, intrinsics, pose in track(
         zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True),
         "keypoints",
@@ -91,3 +91,12 @@ def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[
             f"{source}: its pictures fit a focal length about {best:g} times the map's. "
             "Give their camera: --intrinsics FX,FY,CX,CY."
         )
+
+
+def parse_intrinsics(text: str) -> NDArray[np.float64]:
+    """Read an option's focal lengths and centre, ``FX,FY,CX,CY`` in pixels, as a (3, 3) matrix, for :mod:`argparse`."""
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}: give four numbers, FX,FY,CX,CY") from None
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

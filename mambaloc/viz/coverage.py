@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,7 +22,7 @@ from mambaloc.runtime.maps.viewpoints import spread_m
 from mambaloc.viz.capture import plot_axes
 from mambaloc.viz.png import write_png
 
-Floats = NDArray[np.floating[Any]]
+Floats = NDArray[np.float64]
 
 _HEADINGS = 12
 _PLACES = 14  # across a square of the area that is drawn
@@ -33,8 +32,8 @@ _UPRIGHT_DEG = 25.0
 _MOST_GAPS = 3
 _COLORS = LinearSegmentedColormap.from_list("coverage", ("#b2182b", "#ef8a62", "#fee08b", "#66bd63", "#1a7837"))
 _POINT, _KEY_FRAME, _GAP = "#9a9a9a", "#1f3b6f", "#111111"
-_WIDTH_IN = 8.0
-_MOST_MARGIN = 0.35  # of the longer side of the places
+_WIDTH_IN, _PLOT_IN = 8.0, 6.4
+_MOST_MARGIN = 0.5  # of the longer side of the places
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,19 @@ class Survey:
     certainty: Floats
 
 
+def write_coverage(sparse_map: SparseMap, path: Path) -> str:
+    """Draw a map's coverage, and say what to film next, one line each.
+
+    Args:
+        sparse_map: the map.
+        path: the PNG to write.
+    """
+    found = survey(sparse_map)
+    chosen = gaps(found, sparse_map.key_poses[:, :3, 3] @ found.axes[:2].T)
+    draw_coverage(sparse_map, found, chosen, path)
+    return describe_gaps(found, chosen)
+
+
 def survey(sparse_map: SparseMap) -> Survey:
     """Look around in a map."""
     poses = sparse_map.key_poses
@@ -92,34 +104,39 @@ def survey(sparse_map: SparseMap) -> Survey:
         matches[row], deviation[row] = outlook.of(
             np.array([*place, height]) @ axes, _level_cameras(axes, headings, float(tilt))
         )
-    return Survey(axes, names, places, step, headings, matches, outlook.certainty(matches, deviation))
+    return Survey(axes, names, places, step, headings, matches, np.asarray(outlook.certainty(matches, deviation)))
 
 
 def gaps(found: Survey, walked: Floats) -> list[Gap]:
-    """Say where to film next: up to three regions of places and directions where a camera would be lost.
+    """Say where to film next: up to three places and directions where a camera would be lost, beside some where not.
+
+    From there a film starts in what the map knows, as growing it needs.
 
     Args:
         found: the survey.
-        walked: where the key frames are, (K, 2) in its plane; what is nearest to them counts most.
+        walked: where the key frames are, (K, 2) in its plane; what is near them counts most.
     """
     apart = np.sqrt(((found.places[:, None] - found.places) ** 2).sum(axis=2)) / found.step
     off = np.sqrt(((found.places[:, None] - walked) ** 2).sum(axis=2)).min(axis=1)
-    lost = (1 - found.certainty) ** 2 * np.exp(-((off / (2 * found.step)) ** 2))[:, None]
-    around = np.roll(lost, 1, axis=1) + np.roll(lost, -1, axis=1) + lost
-    region = np.exp(-((apart / 2) ** 2)) @ around
+    nearby = np.exp(-((apart / 2) ** 2))
+    lost, known = (nearby @ _blurred(each) for each in ((1 - found.certainty) ** 2, found.certainty**2))
+    region = lost * known * (1 - found.certainty) * np.exp(-((off / (2 * found.step)) ** 2))[:, None]
     chosen: list[Gap] = []
-    turn = 2 * np.pi / len(found.headings)
     for _ in range(_MOST_GAPS):
         place, heading = np.unravel_index(int(region.argmax()), region.shape)
         if found.certainty[place, heading] > 0.5:
             break
         angle = found.headings[heading]
-        chosen.append(
-            Gap(found.places[place], np.array([np.cos(angle), np.sin(angle)]), float(found.matches[place, heading]))
-        )
-        turns = np.abs((found.headings - angle + np.pi) % (2 * np.pi) - np.pi) / turn
-        region *= 1 - np.exp(-((apart[place, :, None] / 4) ** 2) - ((turns / 2.5) ** 2))
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        chosen.append(Gap(found.places[place], direction, float(found.matches[place, heading])))
+        region *= 1 - np.exp(-((apart[place, :, None] / 4) ** 4))
     return chosen
+
+
+def _blurred(values: Floats) -> Floats:
+    """Sums over neighbouring headings, (G, H)."""
+    turns = ((-2, 0.5), (-1, 1.0), (0, 1.0), (1, 1.0), (2, 0.5))
+    return np.asarray(sum(weight * np.roll(values, shift, axis=1) for shift, weight in turns))
 
 
 def describe_gaps(found: Survey, chosen: list[Gap]) -> str:
@@ -130,8 +147,8 @@ def describe_gaps(found: Survey, chosen: list[Gap]) -> str:
     for number, gap in enumerate(chosen, start=1):
         place = ", ".join(_coordinate(name, value) for name, value in zip(found.names, gap.place, strict=False))
         lines.append(
-            f"film next {number}: from {place}, looking towards {_direction(gap.direction, found.names)}: "
-            f"{gap.matches:.0f} matches are expected there"
+            f"film next {number}: from {place}, looking towards {_direction(gap.direction, found.names)}, "
+            f"where about {gap.matches:.0f} points would be matched"
         )
     return "\n".join(lines)
 
@@ -147,10 +164,10 @@ def draw_coverage(sparse_map: SparseMap, found: Survey, chosen: list[Gap], path:
     """
     points = sparse_map.points_m @ found.axes[:2].T
     low, high = _limits(found, points)
-    height_in = float(np.clip(_WIDTH_IN * (high - low)[1] / (high - low)[0], 3.5, 9.5)) + 1.0
+    height_in = float(np.clip(_PLOT_IN * (high - low)[1] / (high - low)[0], 3.0, 8.0)) + 1.4
     figure = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.scatter(*points.T, s=3, color=_POINT, linewidths=0, zorder=1)
+    axes.scatter(points[:, 0], points[:, 1], s=3, color=_POINT, linewidths=0, zorder=1)
     _draw_discs(axes, found)
     _draw_key_frames(axes, sparse_map, found)
     _draw_gaps(axes, found, chosen)
@@ -177,9 +194,8 @@ def upwards(world_from_cam: Floats) -> Floats:
     up = -world_from_cam[:, :3, 1].mean(axis=0)
     up = up / max(np.linalg.norm(up), 1e-12)
     nearest = int(np.abs(up).argmax())
-    if np.abs(up[nearest]) >= np.cos(np.radians(_UPRIGHT_DEG)):
-        return np.asarray(np.eye(3)[nearest] * np.sign(up[nearest]))
-    return np.asarray(up)
+    is_near = np.abs(up[nearest]) >= np.cos(np.radians(_UPRIGHT_DEG))
+    return np.asarray(np.eye(3)[nearest] * np.sign(up[nearest]) if is_near else up)
 
 
 def _grid(walked: Floats, reach: float) -> tuple[Floats, float]:
@@ -224,16 +240,16 @@ def _draw_key_frames(axes: Axes, sparse_map: SparseMap, found: Survey) -> None:
     axes.add_collection(
         PatchCollection(wedges, facecolor=_KEY_FRAME, edgecolor="white", linewidth=0.3, alpha=0.55, zorder=3)
     )
-    axes.scatter(*place.T, s=7, color=_KEY_FRAME, linewidths=0, zorder=4)
+    axes.scatter(place[:, 0], place[:, 1], s=7, color=_KEY_FRAME, linewidths=0, zorder=4)
 
 
 def _draw_gaps(axes: Axes, found: Survey, chosen: list[Gap]) -> None:
     for number, gap in enumerate(chosen, start=1):
         end = gap.place + 1.6 * found.step * gap.direction
         arrow = {"arrowstyle": "-|>", "color": _GAP, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
-        axes.annotate("", end, gap.place, arrowprops=arrow, zorder=5)
+        axes.annotate("", (end[0], end[1]), (gap.place[0], gap.place[1]), arrowprops=arrow, zorder=5)
         axes.text(
-            *gap.place, str(number), ha="center", va="center", color="white", fontsize=9, fontweight="bold", zorder=6,
+            gap.place[0], gap.place[1], str(number), ha="center", va="center", color="white", fontsize=9, zorder=6,
             bbox={"boxstyle": "circle,pad=0.25", "facecolor": _GAP, "edgecolor": "white", "linewidth": 0.8},
         )  # fmt: skip
 

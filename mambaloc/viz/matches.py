@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,13 +10,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mambaloc.images import Image
-from mambaloc.runtime.maps import CameraPose, MapLocaliser
+from mambaloc.images import Image, read_image
+from mambaloc.mapping import PosedFrames
+from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
 from mambaloc.runtime.rotations import matrix_from_quaternion
 from mambaloc.viz.png import write_png
 
 _MATCHED, _UNMATCHED, _LOST = "#7CFC00", "#dddddd", "#ff5a4d"
 _PANEL_IN = 2.6
+_FRAMES = 4
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,25 @@ class Seen:
     is_accepted: bool
 
 
+def write_points(maps: dict[str, SparseMap], frames: PosedFrames, path: Path, title: str) -> None:
+    """Localise a few frames, evenly spread, in one map or another, and draw which of their keypoints matched.
+
+    Args:
+        maps: by what to call each.
+        frames: to draw.
+        path: the PNG to write.
+        title: heads the plot.
+    """
+    rows = np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))
+    images = [read_image(each) if isinstance(each := frames.images[row], Path) else each for row in rows]
+    localisers = {name: MapLocaliser(sparse_map) for name, sparse_map in maps.items()}
+    seen = {
+        name: [look(localiser, image, frames.intrinsics[row]) for image, row in zip(images, rows, strict=True)]
+        for name, localiser in localisers.items()
+    }
+    draw_matches(seen, path, title)
+
+
 def look(localiser: MapLocaliser, image: Image, intrinsics: NDArray[np.float64]) -> Seen:
     """Localise a picture, and keep which of its keypoints show a point of the map."""
     features = localiser.features(image, intrinsics)
@@ -48,7 +69,7 @@ def look(localiser: MapLocaliser, image: Image, intrinsics: NDArray[np.float64])
     return Seen(image, (features.pixels + 0.5) * scale - 0.5, is_matched, found.is_accepted)
 
 
-def draw_matches(rows: dict[str, Sequence[Seen]], path: Path, title: str) -> None:
+def draw_matches(rows: Mapping[str, Sequence[Seen]], path: Path, title: str) -> None:
     """Draw pictures with their keypoints: matched ones in green, others in grey.
 
     Args:
