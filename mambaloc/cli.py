@@ -20,6 +20,7 @@ from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from mambaloc.callbacks import (
     EarlyStopping,
+    MapBuild,
     OnnxExport,
     PoseProgressBar,
     TrajectoryPlot,
@@ -30,7 +31,8 @@ from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.distillation import LitDistillation
 from mambaloc.errors import InputError
-from mambaloc.evaluation import evaluate_checkpoint, print_table
+from mambaloc.evaluation import evaluate_checkpoint, measure_map_of_run, print_table
+from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.files import read_yaml, writing
 from mambaloc.models import Checkpoint, LitPoseRegressor, list_models
 from mambaloc.models.registry import model_class
@@ -75,6 +77,7 @@ class RecipeCLI(LightningCLI):
             "progress_bar": PoseProgressBar,
             "early_stopping": EarlyStopping,
             "wall_clock": WallClock,
+            "map": MapBuild,
             "onnx_export": OnnxExport,
             "trajectory_plot": TrajectoryPlot,
             "best_checkpoint": ModelCheckpoint,
@@ -149,14 +152,22 @@ class RecipeCLI(LightningCLI):
         if self.trainer.fast_dev_run or not self.trainer.is_global_zero:  # type: ignore[attr-defined]
             return
         run_dir = Path(self.trainer.default_root_dir)
-        found = [path for name in ("best", "last") if (path := run_dir / "checkpoints" / f"{name}.ckpt").is_file()]
+        paths = [run_dir / "checkpoints" / f"{name}.ckpt" for name in ("best", "last")]
+        found = [Checkpoint.read(path) for path in paths if path.is_file()]
+        if not found:
+            return
+        beside = measure_map_of_run(run_dir, found[0].data())
         retrieval = self.config[self.subcommand].retrieval
-        if results := [
-            evaluate_checkpoint(Checkpoint.read(path), run_dir / "evaluation" / path.stem, with_retrieval=retrieval)
-            for path in found
-        ]:
-            print_table(results)
-            print(f"wrote {run_dir}: evaluation/{found[0].stem}/trajectory.png, model.onnx, checkpoints, config.yaml")
+        print_table(
+            [
+                evaluate_checkpoint(
+                    each, run_dir / "evaluation" / each.path.stem, with_retrieval=retrieval, beside=beside
+                )
+                for each in found
+            ]
+        )
+        files = [f"evaluation/{found[0].path.stem}/trajectory.png", "model.onnx", "checkpoints", "config.yaml"]
+        print(f"wrote {run_dir}: {', '.join([str(RUN_MAP), *files] if beside else files)}")
 
 
 def run_directory(config: Namespace) -> Path:

@@ -7,13 +7,15 @@ import logging
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
-from typing import Any
+from typing import Any, TypeVar
 
 from mambaloc.errors import InputError, InputWarning
 
 _as_usual = warnings.formatwarning
+
+T = TypeVar("T")
 
 
 def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
@@ -75,6 +77,16 @@ def pinhole_matrix(text: str) -> list[list[float]]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text}: give FX,FY,CX,CY in pixels") from None
     return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+
+
+def progress(items: Iterable[T], name: str, count: int) -> Iterable[T]:
+    """Pass items on, with a bar in a terminal that goes away at the end."""
+    from rich import get_console  # only here: exported models run without it
+    from rich.progress import track
+
+    if not get_console().is_interactive:  # where Rich ends each bar with an empty line
+        return items
+    return track(items, f"{name:10}", count, transient=True)
 
 
 def quieten() -> None:

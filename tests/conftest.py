@@ -74,6 +74,18 @@ def scenes(made_once):
     return made_once("scenes", render)
 
 
+@pytest.fixture(scope="session")
+def den(made_once):
+    """A root with one scene, the embedded room in the 7-Scenes layout: 32 training and 6 test frames of 160x120."""
+    from mambaloc.rendering import embedded_room, embedded_walk, shots_of_sequences, write_7scenes
+
+    def render(root: Path) -> None:
+        walks = {number: embedded_walk(count, number, 0.0, 360 / count) for number, count in ((1, 32), (2, 6))}
+        write_7scenes(root, "den", shots_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
+
+    return made_once("den", render)
+
+
 def write_recipe(path: Path, scenes: Path, model: dict, data: dict, **trainer) -> Path:
     """Write a recipe that trains a system on ``scenes``."""
     recipe = {
@@ -119,6 +131,20 @@ def trained_student(made_once, scenes):
         main([str(recipe), "--trainer.default_root_dir", str(folder)])
 
     return made_once("trained_student", train)
+
+
+@pytest.fixture(scope="session")
+def trained_with_map(made_once, den):
+    """The folder of a tiny MambaLoc's run of one epoch in ``den``, without validation, and of its map."""
+    from mambaloc.cli import main
+
+    def train(folder: Path) -> None:
+        model = {"class_path": "LitMambaLoc", "init_args": TINY_MAMBALOC}
+        recipe = write_recipe(folder / "recipe.yaml", den, model, {"scene": "den", "validation": "none"}, max_epochs=1)
+        options = ["--map.enabled", "true", "--map.width", "160", "--map.key_frames", "30"]
+        main([str(recipe), *options, "--trainer.default_root_dir", str(folder / "run")])
+
+    return made_once("trained_with_map", train) / "run"
 
 
 @pytest.fixture(scope="session")

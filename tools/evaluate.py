@@ -6,7 +6,7 @@ from mambaloc.cli import OneLineErrorParser
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation import evaluate_checkpoint, print_table
+from mambaloc.evaluation import evaluate_checkpoint, measure_map, measure_map_of_run, print_table
 from mambaloc.models import Checkpoint
 
 
@@ -21,6 +21,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--retrieval", action="store_true", help="also measure retrieval on the backbone's first features"
     )
+    parser.add_argument(
+        "--map", type=Path, metavar="FILE", help="measure it beside the network; the run's unless given"
+    )
     parser.add_class_arguments(PoseDataModule, "data")
     path = parser.parse_args(argv, defaults=False).checkpoint
     if path is None:
@@ -28,10 +31,13 @@ def main(argv: list[str] | None = None) -> None:
     checkpoint = Checkpoint.read(path)
     parser.set_defaults({f"data.{name}": value for name, value in checkpoint.data().hparams.items()})
     args = parser.parse_args(argv)
-    out = args.out or path.parent.parent / "evaluation" / path.stem
+    run = path.parent.parent
+    out = args.out or run / "evaluation" / path.stem
     data = PoseDataModule(**args.data)
-    print_table([evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval)])
-    print(f"{out}: metrics.json, predictions.csv, predictions.tum, trajectory.png")
+    beside = measure_map(args.map, data) if args.map else measure_map_of_run(run, data)
+    print_table([evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval, beside)])
+    both = ", predictions_both.csv, predictions_both.tum" if beside else ""
+    print(f"{out}: metrics.json, predictions.csv, predictions.tum{both}, trajectory.png")
 
 
 if __name__ == "__main__":

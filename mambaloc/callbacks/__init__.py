@@ -1,10 +1,19 @@
 """What happens around training."""
 
 from mambaloc.callbacks.early_stopping import EarlyStopping
+from mambaloc.callbacks.map_build import MapBuild
 from mambaloc.callbacks.onnx_export import OnnxExport
 from mambaloc.callbacks.progress import PoseProgressBar
 from mambaloc.callbacks.trajectory_plot import TrajectoryPlot
 from mambaloc.callbacks.wall_clock import WallClock
 from mambaloc.callbacks.whole_checkpoints import WholeCheckpoints
 
-__all__ = ["EarlyStopping", "OnnxExport", "PoseProgressBar", "TrajectoryPlot", "WallClock", "WholeCheckpoints"]
+__all__ = [
+    "EarlyStopping",
+    "MapBuild",
+    "OnnxExport",
+    "PoseProgressBar",
+    "TrajectoryPlot",
+    "WallClock",
+    "WholeCheckpoints",
+]

@@ -2,5 +2,6 @@
 
 from mambaloc.evaluation.evaluate import evaluate_checkpoint
 from mambaloc.evaluation.report import print_table
+from mambaloc.evaluation.with_map import measure_map, measure_map_of_run
 
-__all__ = ["evaluate_checkpoint", "print_table"]
+__all__ = ["evaluate_checkpoint", "measure_map", "measure_map_of_run", "print_table"]

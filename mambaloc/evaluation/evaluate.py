@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -16,7 +17,8 @@ from mambaloc.evaluation.intervals import BLOCK, LEVEL, block_resamples, median_
 from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.evaluation.references import frozen_features, median_training_pose, nearest_training_pose, retrieval
 from mambaloc.evaluation.trained import Trained, load_trained
-from mambaloc.evaluation.trajectories import write_csv
+from mambaloc.evaluation.trajectories import write_predictions
+from mambaloc.evaluation.with_map import Answers, MeasuredMap
 from mambaloc.files import whole_file, writing
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.models import Checkpoint, LitPoseRegressor
@@ -32,10 +34,12 @@ def evaluate_checkpoint(
     data: PoseDataModule | None = None,
     accelerator: str = "auto",
     with_retrieval: bool = False,
+    beside: MeasuredMap | None = None,
 ) -> dict[str, Any]:
     """Localise every test frame with a checkpoint and write the result to a folder.
 
-    Writes ``metrics.json``, ``predictions.csv``, ``predictions.tum``, ``ground_truth.tum`` and ``trajectory.png``.
+    Writes ``metrics.json``, ``predictions.csv``, ``predictions.tum``, ``ground_truth.tum`` and ``trajectory.png``; with
+    a map also ``predictions_both.csv`` and ``predictions_both.tum``, of both together.
 
     Args:
         checkpoint: of a training.
@@ -43,9 +47,10 @@ def evaluate_checkpoint(
         data: the frames; those of the training recipe unless given.
         accelerator: as Lightning's Trainer takes it.
         with_retrieval: also measure retrieval on the features that the backbone starts with.
+        beside: a map of the place, measured on the same frames.
 
     Returns:
-        What ``metrics.json`` holds.
+        What ``metrics.json`` holds, with infinity where that has null.
 
     Raises:
         InputError: as :func:`~mambaloc.evaluation.trained.load_trained`, for missing or bad data, or a folder that
@@ -57,12 +62,14 @@ def evaluate_checkpoint(
     started = time.perf_counter()
     table = localise_test_frames(system, data, accelerator)
     seconds = time.perf_counter() - started
+    both = beside.beside(table) if beside else None
     result = {
         "metrics": summarise(table),
         "count": len(table.index),
         "data": data.describe(),
         "split": "test",
         "intervals": median_intervals(table, data.frames("test").sequences),
+        **({"map": beside.describe(), "network_and_map": {"metrics": both.summary()}} if beside and both else {}),
         "references": {**_references(data, table), **(_retrieval(backbone, data, table) if backbone else {})},
         "selection": checkpoint.selection,
         "model": _describe_model(system),
@@ -75,7 +82,7 @@ def evaluate_checkpoint(
             "seconds": round(seconds, 3),
         },
     }
-    _write(out, result, table, trained)
+    _write(out, result, table, both, trained)
     return result
 
 
@@ -125,14 +132,26 @@ def _describe_model(system: LitPoseRegressor) -> dict[str, Any]:
     }
 
 
-def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, trained: Trained) -> None:
+def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, both: Answers | None, trained: Trained) -> None:
     frames = trained.data.frames("test")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         with whole_file(out / "metrics.json") as partial:
-            partial.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-        write_csv(out / "predictions.csv", table, frames)
-        write_tum(out / "predictions.tum", table.index.tolist(), table.predicted_position_m, table.predicted_quaternion)
+            partial.write_text(json.dumps(_finite(result), indent=2) + "\n", encoding="utf-8")
+        write_predictions(out / "predictions.csv", table, frames)
         write_tum(out / "ground_truth.tum", table.index.tolist(), table.true_position_m, table.true_quaternion)
         title = f"{result['model']['name']} on {result['data']['scene']}, test, {trained.chosen} epoch"
-        draw_trajectory(table, frames.sequences, out / "trajectory.png", title)
+        if both is None:
+            draw_trajectory(table, frames.sequences, out / "trajectory.png", title)
+            return
+        sources = ["map" if each else "network" for each in both.is_accepted]
+        write_predictions(out / "predictions_both.csv", both.table, frames, sources)
+        title = f"{result['model']['name']} and map on {result['data']['scene']}, test, {trained.chosen} epoch"
+        draw_trajectory(both.table, frames.sequences, out / "trajectory.png", title, table)
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no infinity, which an error is where a map finds no pose."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    return None if isinstance(value, float) and math.isinf(value) else value

@@ -23,29 +23,53 @@ def print_table(results: Sequence[dict[str, Any]]) -> None:
         padding=(0, 0),
     )
     table.add_column("", no_wrap=True)
-    for column in ("median", "mean", "5cm 5°", "25cm 2°", "50cm 5°"):
+    for column in ("median", "mean", "worst", "5cm 5°", "25cm 2°", "50cm 5°"):
         table.add_column(column, justify="right", no_wrap=True)
     for result in results:
-        metrics = result["metrics"]
-        table.add_row(
-            f"{result['selection'].split(':')[0]} (epoch {result['training']['epoch']})",
-            f"{metrics['position_error_m']:.3f} m {metrics['rotation_error_deg']:5.2f}°",
-            f"{metrics['position_error_mean_m']:.3f} m {metrics['rotation_error_mean_deg']:5.2f}°",
-            *(f"{metrics[name]:.0%}" for name in ("recall_5cm_5deg", "recall_25cm_2deg", "recall_50cm_5deg")),
-        )
+        chosen = result["selection"].split(":")[0]
+        table.add_row(f"{chosen} (epoch {result['training']['epoch']})", *_cells(result["metrics"]))
+        if both := result.get("network_and_map"):
+            table.add_row(f"{chosen} and map", *_cells(both["metrics"]))
+    in_map = results[0].get("map")
+    if in_map:
+        table.add_row("map", *_cells(in_map["metrics"]))
     for name, reference in results[0]["references"].items():
-        medians = f"{reference['position_error_m']:.3f} m {reference['rotation_error_deg']:5.2f}°"
-        table.add_row(f"[dim]{name.replace('_', ' ')}", f"[dim]{medians}", *[""] * 4)
+        table.add_row(f"[dim]{name.replace('_', ' ')}", f"[dim]{_medians(reference)}", *[""] * 5)
     console = Console(highlight=False)
     console.print(table)
     for result in results:
         if ":" in result["selection"]:
             console.print(result["selection"], soft_wrap=True)
+    if in_map:
+        console.print(_map_line(in_map), soft_wrap=True)
     if clock := results[-1]["training"]["wall_clock"]:
         console.print(_wall_clock_line(clock), soft_wrap=True)
     skipped = {part: sum(counts.values()) for part, counts in data["skipped"].items() if counts}
     if skipped:
         console.print("skipped frames: " + ", ".join(f"{part} {count}" for part, count in skipped.items()))
+
+
+def _cells(metrics: dict[str, float]) -> list[str]:
+    means = _pose(metrics["position_error_mean_m"], metrics["rotation_error_mean_deg"])
+    recalls = (f"{metrics[name]:.0%}" for name in ("recall_5cm_5deg", "recall_25cm_2deg", "recall_50cm_5deg"))
+    return [_medians(metrics), means, f"{metrics['position_error_worst_m']:.2f}m", *recalls]
+
+
+def _medians(metrics: dict[str, float]) -> str:
+    return _pose(metrics["position_error_m"], metrics["rotation_error_deg"])
+
+
+def _pose(position_m: float, rotation_deg: float) -> str:
+    """Both as wide as fits beside the other columns in a terminal of 80."""
+    return f"{position_m:.{3 if position_m < 10 else 2}f} m {rotation_deg:5.{2 if rotation_deg < 100 else 1}f}°"
+
+
+def _map_line(in_map: dict[str, Any]) -> str:
+    metrics = in_map["metrics"]
+    return (
+        f"map: {metrics['accepted']:.1%} of its poses accepted, {metrics['accepted_and_wrong']:.1%} of them wrong "
+        f"(over 0.2 m or 5°); {metrics['query_cpu_ms']:.0f} ms of CPU time a picture, {in_map['mib']:.2f} MiB"
+    )
 
 
 def _wall_clock_line(clock: dict[str, Any]) -> str:

@@ -1,22 +1,34 @@
-"""Per-frame predictions as a CSV file."""
+"""Per-frame predictions as files."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 from mambaloc.data import Frames
 from mambaloc.files import whole_file
 from mambaloc.metrics import PoseErrorTable
+from mambaloc.runtime.trajectory import write_tum
 
 
-def write_csv(path: Path, table: PoseErrorTable, frames: Frames) -> None:
-    """Write a row a frame: image, both poses as ``world_from_cam`` wxyz in metres, and the errors."""
+def write_predictions(path: Path, table: PoseErrorTable, frames: Frames, sources: Sequence[str] | None = None) -> None:
+    """Write predictions as CSV and, beside it, as a TUM trajectory.
+
+    A row of the CSV file is a frame: image, both poses as ``world_from_cam`` wxyz in metres, and the errors.
+
+    Args:
+        path: the CSV file.
+        table: the predictions.
+        frames: of the split.
+        sources: what found each pose, for a last column.
+    """
     pose = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
     header = ["index", "image", *(f"predicted_{c}" for c in pose), *(f"true_{c}" for c in pose)]
+    header += ["position_error_m", "rotation_error_deg", *(["source"] if sources else [])]
     with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([*header, "position_error_m", "rotation_error_deg"])
+        writer.writerow(header)
         for row, index in enumerate(table.index.tolist()):
             numbers = (
                 *table.predicted_position_m[row].tolist(),
@@ -26,5 +38,6 @@ def write_csv(path: Path, table: PoseErrorTable, frames: Frames) -> None:
                 table.position_error_m[row].item(),
                 table.rotation_error_deg[row].item(),
             )
-            image = frames.image_paths[index]
-            writer.writerow([index, f"{image.parent.name}/{image.name}", *(f"{n:.9g}" for n in numbers)])
+            image, source = frames.image_paths[index], sources[row : row + 1] if sources else []
+            writer.writerow([index, f"{image.parent.name}/{image.name}", *(f"{n:.9g}" for n in numbers), *source])
+    write_tum(path.with_suffix(".tum"), table.index.tolist(), table.predicted_position_m, table.predicted_quaternion)

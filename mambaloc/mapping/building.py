@@ -12,14 +12,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
+from mambaloc.console import progress
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb, read_image
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.pairs import pairs_by_pose
-from mambaloc.mapping.tracks import connected, match_pair
-from mambaloc.mapping.triangulation import Observations, triangulate
+from mambaloc.mapping.structure import Structure, recover_structure
+from mambaloc.mapping.tracks import match
+from mambaloc.runtime.maps.drift import fit_drift
 from mambaloc.runtime.maps.features import Features, detect_features, quantized
 from mambaloc.runtime.maps.sparse_map import SparseMap
 
@@ -92,28 +93,29 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
         raise InputError(
             f"{scene}: no two of {len(key)} key frames look the same way from apart. Film while walking, not turning."
         )
-    cam_from_world = np.linalg.inv(key.world_from_cam)
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         features = _each(pool, lambda row: _features(key, row, settings.width), range(len(key)), "keypoints")
-        near = epipolar_px(settings.width)
-        matches = _each(pool, lambda pair: match_pair(features, cam_from_world, pair, near), list(pairs), "matches")
-    agreeing = sum(len(rows) for rows, _ in matches) / max(sum(tried for _, tried in matches), 1)
-    seen, keypoint = keypoint_tracks(features, pairs, [rows for rows, _ in matches], near)
-    points, descriptors, views = points_of_tracks(
-        features, cam_from_world, seen, keypoint, np.random.default_rng(settings.seed)
-    )
-    _check_enough(scene, features, agreeing, len(points), settings.least_inliers)
-    kept = _within(views, settings.most_bytes)
+        if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
+            raise InputError(
+                f"{scene}: its frames have {keypoints:.0f} keypoints each. Film texture, or enlarge width."
+            )
+        matches = _each(pool, lambda pair: match(features[pair[0]], features[pair[1]]), list(pairs), "matches")
+    rng = np.random.default_rng(settings.seed)
+    structure = recover_structure(features, key.world_from_cam, pairs, matches, rng)
+    _check_enough(scene, structure, settings.least_inliers)
+    kept = _within(structure.views, settings.most_bytes)
     return SparseMap(
-        points[kept].astype(np.float32),
-        quantized(descriptors[kept]),
-        np.packbits(views[kept], axis=1),
-        np.array(key.world_from_cam, np.float64),
+        structure.points_m[kept].astype(np.float32),
+        quantized(structure.descriptors[kept]),
+        np.packbits(structure.views[kept], axis=1),
+        structure.world_from_cam.astype(np.float64),
         features[0].size,
         features[0].intrinsics,
         settings.least_inliers,
         scene,
         {"poses": hashlib.sha256(frames.world_from_cam.tobytes() + frames.intrinsics.tobytes()).hexdigest()},
+        structure.lens,
+        fit_drift(structure.world_from_cam, key.world_from_cam),
     )
 
 
@@ -123,13 +125,8 @@ def _within(views: NDArray[np.bool_], most_bytes: int) -> Indices:
     return np.argsort(-views.sum(axis=1), kind="stable")[: most_bytes // bytes_each]
 
 
-def epipolar_px(width: int) -> float:
-    """How far a match may be from its epipolar line, and a point from where it is seen, in a picture so wide."""
-    return 4 * width / 160
-
-
 def _each(pool: ThreadPoolExecutor, work: Callable[[S], T], items: Sequence[S], name: str) -> list[T]:
-    return list(track(pool.map(work, items), f"{name:9}", len(items), transient=True))
+    return list(progress(pool.map(work, items), name, len(items)))
 
 
 def _features(frames: PosedFrames, row: int, width: int) -> Features:
@@ -140,57 +137,11 @@ def _features(frames: PosedFrames, row: int, width: int) -> Features:
     return detect_features(rgb, frames.intrinsics[row], width / rgb.shape[1])
 
 
-def keypoint_tracks(
-    features: Sequence[Features], pairs: Indices, matches: Sequence[Indices], near: float
-) -> tuple[Observations, Indices]:
-    """Keypoints that matches connect, and which each is, of all frames' laid end to end (O,)."""
-    first = np.cumsum([0, *(len(each) for each in features)])
-    edges = np.concatenate([rows + first[pair] for pair, rows in zip(pairs, matches, strict=True)])
-    root = connected(first[-1], edges)
-    keypoint = np.unique(edges)
-    keypoint = keypoint[np.argsort(root[keypoint], kind="stable")]
-    frame = np.searchsorted(first, keypoint, side="right") - 1
-    rays = np.concatenate([each.rays for each in features])
-    focal_px = np.array([each.intrinsics[0, 0] for each in features])
-    return Observations(frame, root[keypoint], rays[keypoint], near / focal_px[frame]).renumbered(), keypoint
-
-
-def points_of_tracks(
-    features: Sequence[Features],
-    cam_from_world: Floats,
-    seen: Observations,
-    keypoint: Indices,
-    rng: np.random.Generator,
-) -> tuple[Floats, NDArray[np.float32], NDArray[np.bool_]]:
-    """Triangulate, and once more what the first points leave of their tracks, where two points were taken for one.
-
-    Returns:
-        Points (P, 3), their mean descriptors (P, 128), and which frames see each (P, N).
-    """
-    every = np.concatenate([each.descriptors for each in features])
-    found = []
-    for _ in range(2):
-        points, is_point, agrees = triangulate(cam_from_world, seen, rng)
-        used = agrees & is_point[seen.track]
-        mean = np.zeros((len(points), 128), np.float32)
-        np.add.at(mean, seen.track[used], every[keypoint[used]])
-        views = np.zeros((len(points), len(features)), bool)
-        views[seen.track[used], seen.frame[used]] = True
-        found.append((points[is_point], mean[is_point], views[is_point]))
-        left = ~used
-        left &= np.bincount(seen.track[left], minlength=len(points))[seen.track] >= 2
-        seen, keypoint = seen.select(left).renumbered(), keypoint[left]
-    points, mean, views = (np.concatenate(each) for each in zip(*found, strict=True))
-    return points, mean / np.linalg.norm(mean, axis=1, keepdims=True), views
-
-
-def _check_enough(scene: str, features: Sequence[Features], agreeing: float, points: int, least: int) -> None:
-    if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
-        raise InputError(f"{scene}: its frames have {keypoints:.0f} keypoints each. Film texture, or enlarge width.")
-    if agreeing < _LEAST_AGREEING:
+def _check_enough(scene: str, structure: Structure, least: int) -> None:
+    if structure.agreeing < _LEAST_AGREEING:
         raise InputError(
-            f"{scene}: {100 * agreeing:.0f} % of the matches between its frames agree with their poses. "
+            f"{scene}: {100 * structure.agreeing:.0f} % of the matches between its frames agree with their poses. "
             "Check that poses and intrinsics belong to the pictures."
         )
-    if points < least:
+    if (points := len(structure.points_m)) < least:
         raise InputError(f"{scene}: its frames give {points} points. Give more frames, taken from further apart.")

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from mambaloc import provenance
+from mambaloc.console import progress
 from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, Split
@@ -23,13 +23,13 @@ from mambaloc.files import sha256, whole_file, writing
 from mambaloc.images import read_image
 from mambaloc.mapping.building import PosedFrames, build_map
 from mambaloc.mapping.recipe import MapRecipe
+from mambaloc.metrics import summarise_errors
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
 from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.float64]
 
-_WITHIN = (0.1, 5.0)  # metres and degrees
-_WRONG = (0.2, 5.0)
+_WRONG = (0.2, 5.0)  # metres and degrees
 
 
 @dataclass(frozen=True)
@@ -46,20 +46,14 @@ class MapErrors:
     cpu_s: Floats
 
     def summary(self) -> dict[str, float]:
-        """Medians count frames without a pose as infinitely wrong; means leave them out."""
-        has_pose, wrong = np.isfinite(self.position_m), ~self._within(*_WRONG)
+        """As :func:`~mambaloc.metrics.summarise_errors`, and how often a pose is accepted, and wrong all the same."""
+        is_wrong = (self.position_m > _WRONG[0]) | (self.rotation_deg > _WRONG[1])
         return {
-            "position_error_m": float(np.median(self.position_m)),
-            "rotation_error_deg": float(np.median(self.rotation_deg)),
-            "position_error_mean_m": _mean(self.position_m[has_pose]),
-            "rotation_error_mean_deg": _mean(self.rotation_deg[has_pose]),
-            "position_error_worst_m": float(self.position_m.max()),
-            "without_pose": float((~has_pose).mean()),
+            **summarise_errors(self.position_m, self.rotation_deg),
+            "without_pose": float(np.isinf(self.position_m).mean()),
             "above_20cm": float((self.position_m > _WRONG[0]).mean()),
-            "recall_5cm_5deg": float(self._within(0.05, 5).mean()),
-            "recall_10cm_5deg": float(self._within(*_WITHIN).mean()),
             "accepted": float(self.is_accepted.mean()),
-            "accepted_and_wrong": float((wrong & self.is_accepted).sum() / max(self.is_accepted.sum(), 1)),
+            "accepted_and_wrong": float((is_wrong & self.is_accepted).sum() / max(self.is_accepted.sum(), 1)),
             "query_cpu_ms": float(1000 * self.cpu_s.mean()),
         }
 
@@ -71,9 +65,6 @@ class MapErrors:
             f"{100 * summary['recall_10cm_5deg']:.1f} % within 10 cm 5 deg, {100 * summary['accepted']:.1f} % accepted"
         )
 
-    def _within(self, position_m: float, rotation_deg: float) -> NDArray[np.bool_]:
-        return (self.position_m <= position_m) & (self.rotation_deg <= rotation_deg)
-
 
 def read_frames(recipe: MapRecipe, split: Split) -> PosedFrames:
     """Read a split of a recipe's scene with its cameras.
@@ -83,7 +74,15 @@ def read_frames(recipe: MapRecipe, split: Split) -> PosedFrames:
     """
     dataset, root, scene = locate(recipe.dataset, recipe.root, recipe.scene)
     folder = scene_folder(dataset, Path(root) if root else None, scene)
-    frames = DATASETS[dataset].read_split(folder, split, BadFrames())
+    return with_cameras(dataset, folder, DATASETS[dataset].read_split(folder, split, BadFrames()))
+
+
+def with_cameras(dataset: str, folder: Path, frames: Frames) -> PosedFrames:
+    """Add the cameras to frames of a scene.
+
+    Raises:
+        InputError: where they are unknown.
+    """
     return PosedFrames(frames.image_paths, frame_intrinsics(dataset, folder, frames), _world_from_cam(frames))
 
 
@@ -91,11 +90,8 @@ def measure(sparse_map: SparseMap, frames: PosedFrames, seeds: Sequence[int]) ->
     """Localise frames in a map, once a seed; time is this process's own on all cores, without decoding the picture."""
     localisers = [MapLocaliser(sparse_map, seed) for seed in seeds]
     rows = []
-    for image, intrinsics, truth in track(
-        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True),
-        "queries  ",
-        len(frames),
-        transient=True,
+    for image, intrinsics, truth in progress(
+        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True), "queries", len(frames)
     ):
         rgb = read_image(image) if isinstance(image, Path) else image
         for localiser in localisers:
@@ -175,10 +171,6 @@ def describe(result: dict[str, Any]) -> str:
         f"{100 * metrics['recall_10cm_5deg']:.1f} % within 10 cm 5 deg, {made['mib']:.2f} MiB, "
         f"{made['core_seconds']:.1f} core-seconds, {metrics['query_cpu_ms']:.0f} ms a query"
     )
-
-
-def _mean(errors: Floats) -> float:
-    return float(errors.mean()) if len(errors) else math.inf
 
 
 def _world_from_cam(frames: Frames) -> Floats:

@@ -9,21 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.mapping.building import epipolar_px, keypoint_tracks, points_of_tracks
-from mambaloc.mapping.bundle_adjustment import Prior, adjust
+from mambaloc.mapping.adjusting import Bundle, adjust
 from mambaloc.mapping.pairs import pairs_by_pose
-from mambaloc.mapping.tracks import match_pair
-from mambaloc.mapping.triangulation import Observations, residuals, triangulate
+from mambaloc.mapping.structure import mean_descriptors, triangulated
+from mambaloc.mapping.tracks import agreeing, match
+from mambaloc.mapping.triangulation import Observations
 from mambaloc.runtime.maps import CameraPose, MapLocaliser
 from mambaloc.runtime.maps.features import Features
-from mambaloc.runtime.maps.viewpoints import spread_m
+from mambaloc.runtime.maps.lens import Lens
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
 
-_BANDS = (3, 1)  # times how far a match may be from its epipolar line; poses that were found one after another drift
+# How far a match may be from its epipolar line, and a point from where it is seen, in pixels of a picture of 160, by
+# round: frames that were found one after another drift at first.
+_NEAR_PX = (12.0, 4.0, 2.0)
+_SIGMA = 0.125  # of that
 _LEAST_AGREEING = 0.3  # of the matches of a pair
-_GIVEN_DEG = 1.0  # deviation of given poses
+_LOOSE = 100.0  # prior of poses that only the map gives
 
 
 @dataclass(frozen=True)
@@ -51,76 +54,61 @@ def extend(
         localiser: in the map.
         features: of each new key frame.
         world_from_cam: where the map found it, (N, 4, 4).
-        given: the same from elsewhere, a prior with a deviation of one degree; None where that is not known.
+        given: the same from elsewhere, a prior; None where that is not known.
     """
-    rng, band_px = np.random.default_rng(0), epipolar_px(localiser.map.size[0])
-    cam_from_world = np.linalg.inv(world_from_cam)
-    for band in _BANDS:
-        look = _Look.of(localiser, features, cam_from_world, band * band_px)
-        cam_from_world = _adjusted(localiser, look, cam_from_world, given)
-    look = _Look.of(localiser, features, cam_from_world, band_px)
-    points_m, descriptors, views = points_of_tracks(look.rest, cam_from_world, look.seen, look.keypoint, rng)
+    sparse_map, rng, poses = localiser.map, np.random.default_rng(0), world_from_cam
+    unit_px, focal_px = sparse_map.size[0] / 160, sparse_map.intrinsics[0, 0]
+    for near_px in _NEAR_PX:
+        known, rest = _known(localiser, features, poses, near_px * unit_px / focal_px)
+        pairs, matches = _pairs(rest, poses, near_px * unit_px)
+        points_m, seen, keypoint, _ = triangulated(rest, poses, pairs, matches, near_px * unit_px, rng)
+        if near_px != _NEAR_PX[-1] and len(poses) > 1:
+            both, tracks = _joined(known, seen, len(sparse_map))
+            every_m = np.concatenate((sparse_map.points_m, points_m))[tracks]
+            start, is_fixed = Bundle(poses, every_m, Lens()), tracks < len(sparse_map)
+            sigma, prior, looseness = _SIGMA * near_px * unit_px / focal_px, given, 1.0
+            if prior is None:
+                prior, looseness = poses, _LOOSE
+            poses = adjust(start, prior, both, sigma, False, is_fixed, looseness).world_from_cam
+    descriptors, views = mean_descriptors(rest, len(points_m), seen, keypoint)
     order = np.argsort(-views.sum(axis=1), kind="stable")
-    known = np.zeros((len(localiser.map), len(features)), bool)
-    known[look.known.track, look.known.frame] = True
-    return Extension(np.linalg.inv(cam_from_world), known, points_m[order], descriptors[order], views[order])
+    old = np.zeros((len(sparse_map), len(features)), bool)
+    old[known.track, known.frame] = True
+    return Extension(poses, old, points_m[order], descriptors[order], views[order])
 
 
-@dataclass(frozen=True)
-class _Look:
-    """What key frames see: ``known`` points of the map, whose rows are the tracks, and in the ``rest`` new tracks."""
-
-    known: Observations
-    rest: list[Features]
-    seen: Observations
-    keypoint: Indices
-
-    @classmethod
-    def of(cls, localiser: MapLocaliser, features: Sequence[Features], cam_from_world: Floats, band_px: float) -> _Look:
-        known, rest = [], []
-        for row, (each, pose) in enumerate(zip(features, np.linalg.inv(cam_from_world), strict=True)):
-            keypoints, points = localiser.matches(each, CameraPose(pose[:3, :3], pose[:3, 3]))
-            known.append((np.full(len(points), row), points, each.rays[keypoints]))
-            rest.append(each.select(np.setdiff1d(np.arange(len(each)), keypoints)))
-        frame, track, rays = (np.concatenate(each) for each in zip(*known, strict=True))
-        order = np.argsort(track, kind="stable")
-        near = np.full(len(order), band_px / localiser.map.intrinsics[0, 0])
-        return cls(
-            Observations(frame[order], track[order], rays[order], near), rest, *_tracks(rest, cam_from_world, band_px)
-        )
+def _known(
+    localiser: MapLocaliser, features: Sequence[Features], world_from_cam: Floats, near: float
+) -> tuple[Observations, list[Features]]:
+    """What frames see of the map, whose points are the tracks, and the rest of their keypoints."""
+    found, rest = [], []
+    for row, (each, pose) in enumerate(zip(features, world_from_cam, strict=True)):
+        keypoints, points = localiser.matches(each, CameraPose(pose[:3, :3], pose[:3, 3]))
+        found.append((np.full(len(points), row), points, each.rays[keypoints]))
+        rest.append(each.select(np.setdiff1d(np.arange(len(each)), keypoints)))
+    frame, track, rays = (np.concatenate(each) for each in zip(*found, strict=True))
+    order = np.argsort(track, kind="stable")
+    return Observations(frame[order], track[order], rays[order], np.full(len(order), near)), rest
 
 
-def _tracks(features: Sequence[Features], cam_from_world: Floats, band_px: float) -> tuple[Observations, Indices]:
-    """What the frames see together; pairs whose matches mostly disagree with the poses are left out."""
+def _pairs(features: Sequence[Features], world_from_cam: Floats, near_px: float) -> tuple[Indices, list[Indices]]:
+    """Pairs of frames and their matches, but for pairs whose matches mostly disagree with the poses."""
     pairs, matches = [], []
-    for pair in pairs_by_pose(np.linalg.inv(cam_from_world)):
-        rows, tried = match_pair(features, cam_from_world, pair, band_px)
-        if len(rows) > _LEAST_AGREEING * tried:
+    cam_from_world = np.linalg.inv(world_from_cam)
+    for pair in pairs_by_pose(world_from_cam):
+        rows = match(features[pair[0]], features[pair[1]])
+        if len(agreeing(features, cam_from_world, pair, rows, near_px)) > _LEAST_AGREEING * len(rows):
             pairs.append(pair)
             matches.append(rows)
-    if not pairs:
-        nothing = np.empty(0, np.int64)
-        return Observations(nothing, nothing, np.empty((0, 2)), np.empty(0)), nothing
-    return keypoint_tracks(features, np.array(pairs), matches, band_px)
+    return np.array(pairs, np.int64).reshape(-1, 2), matches
 
 
-def _adjusted(localiser: MapLocaliser, look: _Look, cam_from_world: Floats, given: Floats | None) -> Floats:
-    """Poses ``cam_from_world`` by bundle adjustment."""
-    new_m, is_point, agrees = triangulate(cam_from_world, look.seen, np.random.default_rng(0))
-    new, known = look.seen.select(agrees & is_point[look.seen.track]), look.known
+def _joined(known: Observations, seen: Observations, points: int) -> tuple[Observations, Indices]:
+    """Observations of the map's points and of new ones, and the rows of those in both laid end to end."""
     both = Observations(
-        np.concatenate((known.frame, new.frame)),
-        np.concatenate((known.track, len(localiser.map) + new.track)),
-        np.concatenate((known.rays, new.rays)),
-        np.concatenate((known.near, new.near)),
+        np.concatenate((known.frame, seen.frame)),
+        np.concatenate((known.track, points + seen.track)),
+        np.concatenate((known.rays, seen.rays)),
+        np.concatenate((known.near, seen.near)),
     )
-    tracks, both = np.unique(both.track), both.renumbered()
-    points_m = np.concatenate((localiser.map.points_m, new_m))[tracks]
-    both = both.as_near_as(residuals(cam_from_world, both, points_m))
-    unit_m = spread_m(localiser.map.key_poses)
-    if given is None:
-        start, prior = cam_from_world, Prior(np.pi, 10 * unit_m)
-    else:
-        start, prior = np.linalg.inv(given), Prior(np.radians(_GIVEN_DEG), np.radians(_GIVEN_DEG) * 3 * unit_m)
-    is_fixed = tracks < len(localiser.map)
-    return adjust(cam_from_world, both, points_m, prior, given=start, fixed=is_fixed)[0]
+    return both.renumbered(), np.unique(both.track)

@@ -130,7 +130,7 @@ def remove_session(sparse_map: SparseMap, session: str) -> SparseMap:
 
 
 def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -> tuple[dict[int, CameraPose], int]:
-    """Poses of those frames that the map finds, and how many it finds elsewhere than they were given."""
+    """Poses of the frames that the map finds, in its own frame, and how many contradict those given."""
     localiser, unit_m = MapLocaliser(sparse_map), spread_m(sparse_map.key_poses)
     found, contradict = {}, 0
     for row in rows:
@@ -139,7 +139,7 @@ def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -
         if located.is_accepted:
             pose = CameraPose(matrix_from_quaternion(located.quaternion), located.position_m)
             if given is None or _agree(pose, given, unit_m):
-                found[row] = pose
+                found[row] = localiser.drift.to_adjusted(pose)
             else:
                 contradict += 1
     return found, contradict
@@ -151,9 +151,10 @@ def _grown(
     """The map with frames whose poses are known, and which became key frames; their poses are adjusted in place."""
     rows = np.array(sorted(poses))
     key = rows[farthest_first(np.stack([poses[row].matrix for row in rows]), most)].tolist()
-    given = [pose.matrix for row in key if (pose := frames[row].given) is not None]
+    localiser = MapLocaliser(sparse_map)
+    given = [localiser.drift.to_adjusted(pose).matrix for row in key if (pose := frames[row].given) is not None]
     new = extend(
-        MapLocaliser(sparse_map),
+        localiser,
         [frames[row].features for row in key],
         np.stack([poses[row].matrix for row in key]),
         np.stack(given) if len(given) == len(key) else None,

@@ -32,7 +32,8 @@ class MapRecipe:
 
 
 _TYPES = {"scene": str, "dataset": str, "root": str, "label": str}
-_LEAST = {"key_frames": 2, "width": 32, "most_bytes": 1000, "least_inliers": 4, "seed": 0}
+LEAST = {"key_frames": 2, "width": 32, "most_bytes": 1000, "least_inliers": 4, "seed": 0}
+"""The least that each setting of a map may be."""
 
 
 def read_recipe(path: Path) -> MapRecipe:
@@ -47,17 +48,17 @@ def read_recipe(path: Path) -> MapRecipe:
     for key, value in data.items():
         if key in _TYPES:
             fits, what = isinstance(value, str), "a text"
-        elif key in _LEAST:
-            fits, what = _is_int(value, _LEAST[key]), f"a whole number of {_LEAST[key]} or more"
+        elif key in LEAST:
+            fits, what = _is_int(value, LEAST[key]), f"a whole number of {LEAST[key]} or more"
         elif key == "ransac_seeds":
             fits = isinstance(value, list) and len(value) > 0 and all(_is_int(seed, 0) for seed in value)
             what = "a list of whole numbers"
         else:
-            known = ", ".join((*_TYPES, *_LEAST, "ransac_seeds"))
+            known = ", ".join((*_TYPES, *LEAST, "ransac_seeds"))
             raise InputError(f"{path}: {key!r} is unknown. Choose among {known}.")
         if not fits:
             raise InputError(f"{path}: {key} is {str(value)[:40]!r}. Give {what}.")
-    settings = MapSettings(**{key: value for key, value in data.items() if key in _LEAST})
+    settings = MapSettings(**{key: value for key, value in data.items() if key in LEAST})
     texts = {key: value for key, value in data.items() if key in _TYPES}
     return MapRecipe(**texts, settings=settings, ransac_seeds=tuple(data.get("ransac_seeds", (0, 1, 2))))
 

@@ -48,23 +48,22 @@ def sampson_distance(second_from_first: Floats, first: Floats, second: Floats) -
     return np.abs((end * lines).sum(axis=1)) / np.sqrt(np.maximum(slope, np.finfo(float).tiny))
 
 
-def match_pair(features: Sequence[Features], cam_from_world: Floats, pair: Indices, near: float) -> tuple[Indices, int]:
-    """Match two frames, and keep what lies near its epipolar line.
+def agreeing(
+    features: Sequence[Features], cam_from_world: Floats, pair: Indices, rows: Indices, near_px: float
+) -> Indices:
+    """Keep the matches of two frames that lie near their epipolar line.
 
     Args:
         features: of every frame.
         cam_from_world: of every frame, (N, 4, 4).
         pair: two rows of frames.
-        near: the line, in pixels of the frames as they were searched.
-
-    Returns:
-        Rows of keypoints of both, (M, 2), and how many matches there were before.
+        rows: of keypoints of both, (M, 2).
+        near_px: how far from the line, in pixels of the frames as they were searched.
     """
     first, second = (features[row] for row in pair)
-    rows = match(first, second)
     second_from_first = cam_from_world[pair[1]] @ np.linalg.inv(cam_from_world[pair[0]])
     off = sampson_distance(second_from_first, first.rays[rows[:, 0]], second.rays[rows[:, 1]])
-    return rows[off * first.intrinsics[0, 0] <= near], len(rows)
+    return rows[off * first.intrinsics[0, 0] <= near_px]
 
 
 def connected(count: int, edges: Indices) -> Indices:

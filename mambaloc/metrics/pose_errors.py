@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Self
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
@@ -15,6 +19,7 @@ from mambaloc.types import PoseBatch, PosePrediction
 
 RECALL_THRESHOLDS: dict[str, tuple[float, float]] = {
     "recall_5cm_5deg": (0.05, 5.0),
+    "recall_10cm_5deg": (0.10, 5.0),
     "recall_25cm_2deg": (0.25, 2.0),
     "recall_50cm_5deg": (0.50, 5.0),
 }
@@ -27,7 +32,7 @@ class PoseErrorTable:
 
     Shape:
         ``index``, ``position_error_m`` and ``rotation_error_deg`` (N,); positions (N, 3) in metres; quaternions
-        (N, 4), canonical.
+        (N, 4), canonical. Errors are infinite where no pose was found.
     """
 
     index: Tensor
@@ -37,6 +42,27 @@ class PoseErrorTable:
     true_quaternion: Tensor
     position_error_m: Tensor
     rotation_error_deg: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        index: Tensor,
+        predicted_position_m: Tensor,
+        predicted_quaternion: Tensor,
+        true_position_m: Tensor,
+        true_quaternion: Tensor,
+    ) -> Self:
+        """Compute the errors of predictions; quaternions may have any sign."""
+        predicted_quaternion, true_quaternion = canonical(predicted_quaternion), canonical(true_quaternion)
+        return cls(
+            index,
+            predicted_position_m,
+            predicted_quaternion,
+            true_position_m,
+            true_quaternion,
+            position_error_m(predicted_position_m, true_position_m),
+            rotation_error_deg(predicted_quaternion, true_quaternion),
+        )
 
 
 class PoseErrors(Metric):
@@ -85,19 +111,8 @@ class PoseErrors(Metric):
         order = index.unique(return_inverse=True)[1]
         first = torch.full((int(order.max()) + 1,), len(index), device=index.device)
         first = first.scatter_reduce(0, order, torch.arange(len(index), device=index.device), "amin")
-        predicted_m, true_m = (dim_zero_cat(s)[first] for s in (self.predicted_position_m, self.true_position_m))
-        predicted_q, true_q = (
-            canonical(dim_zero_cat(s)[first]) for s in (self.predicted_quaternion, self.true_quaternion)
-        )
-        return PoseErrorTable(
-            index=index[first],
-            predicted_position_m=predicted_m,
-            predicted_quaternion=predicted_q,
-            true_position_m=true_m,
-            true_quaternion=true_q,
-            position_error_m=position_error_m(predicted_m, true_m),
-            rotation_error_deg=rotation_error_deg(predicted_q, true_q),
-        )
+        poses = (self.predicted_position_m, self.predicted_quaternion, self.true_position_m, self.true_quaternion)
+        return PoseErrorTable.of(index[first], *(dim_zero_cat(state)[first] for state in poses))
 
 
 def error_table(localise: Callable[[Tensor], PosePrediction], batches: Iterable[PoseBatch]) -> PoseErrorTable:
@@ -116,18 +131,29 @@ def error_table(localise: Callable[[Tensor], PosePrediction], batches: Iterable[
 
 
 def summarise(table: PoseErrorTable) -> dict[str, float]:
-    """Reduce per-frame errors to medians, means and recalls; the plain names are the medians.
+    """Reduce per-frame errors; see :func:`summarise_errors`."""
+    return summarise_errors(table.position_error_m.cpu().numpy(), table.rotation_error_deg.cpu().numpy())
 
-    The median of an even number of frames is the mean of the middle two.
+
+def summarise_errors(position_m: ArrayLike, rotation_deg: ArrayLike) -> dict[str, float]:
+    """Reduce errors to medians, means, the worst position and recalls; the plain names are the medians.
+
+    The median of an even number of frames is the mean of the middle two. An infinite error, of a frame without a pose,
+    counts in medians and recalls, and is left out of means, which are infinite where no other is left. NaN stays NaN.
+
+    Args:
+        position_m: one a frame, (N,).
+        rotation_deg: of the same frames.
     """
-    # On the CPU: Apple's GPUs know no double.
-    position_m, rotation_deg = table.position_error_m.cpu().double(), table.rotation_error_deg.cpu().double()
+    position_m, rotation_deg = np.asarray(position_m, np.float64), np.asarray(rotation_deg, np.float64)
+    has_pose = ~np.isinf(position_m)
     summary = {
-        "position_error_m": position_m.quantile(0.5).item(),
-        "rotation_error_deg": rotation_deg.quantile(0.5).item(),
-        "position_error_mean_m": position_m.mean().item(),
-        "rotation_error_mean_deg": rotation_deg.mean().item(),
+        "position_error_m": float(np.median(position_m)),
+        "rotation_error_deg": float(np.median(rotation_deg)),
+        "position_error_mean_m": float(position_m[has_pose].mean()) if has_pose.any() else math.inf,
+        "rotation_error_mean_deg": float(rotation_deg[has_pose].mean()) if has_pose.any() else math.inf,
+        "position_error_worst_m": float(position_m.max()),
     }
     for name, (within_m, within_deg) in RECALL_THRESHOLDS.items():
-        summary[name] = ((position_m <= within_m) & (rotation_deg <= within_deg)).double().mean().item()
+        summary[name] = float(((position_m <= within_m) & (rotation_deg <= within_deg)).mean())
     return summary

@@ -47,7 +47,7 @@ def write_report(
         raise InputError(f"{store}: holds no result of the {epoch} epoch; run a sweep into it first")
     if out.exists():
         raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
-    sections = [_results(rows)]
+    sections = [_results(rows), *_with_maps(rows)]
     for number, (axis, before, after) in enumerate(comparisons):
         found = differences(trials, axis, before, after, epoch)
         sections.append(_compared(f"difference_{number + 1}", axis, before, after, found))
@@ -105,6 +105,32 @@ def _results(rows: Sequence[Row]) -> Section:
         counts = [f"{mean(row.train_s):.1f}", f"{mean(row.steps):.0f}", str(row.train_frames), str(row.test_frames)]
         table.append([*line, *counts, beats, row.data, row.selection])
     return Section("results", "Results", text, table)
+
+
+def _with_maps(rows: Sequence[Row]) -> list[Section]:
+    """The networks beside a map; nothing where none was built."""
+    text = (
+        "The map's pose where it is accepted, otherwise the network's. Means over seeds of the networks. A map has no "
+        "such seed; each picture was localised with one seed of RANSAC. Wrong: by more than 0.2 m or 5°. CPU time is "
+        "what the map took on all cores. The map alone is among the references."
+    )
+    header = [*rows[0].labels, "seeds"]
+    for name in ERRORS:
+        header += [f"network alone, {NAMES[name]}", f"network and map, {NAMES[name]}", "from", "to"]
+    table = [[*header, "worst (m)", "answered by the map", "of these wrong", "CPU ms a picture", "map (MiB)"]]
+    for row in rows:
+        if row.both is None:
+            continue
+        line = [*row.labels.values(), " ".join(row.seeds)]
+        for name in ERRORS:
+            both = row.both[name]
+            line += [f"{value:.3f}" for value in (row.errors[name].mean, both.mean, both.low, both.high)]
+        metrics = [trial["network_and_map"]["metrics"] for trial in row.trials]
+        line.append(f"{max(each['position_error_worst_m'] for each in metrics):.2f}")
+        line += [f"{mean(each[name] for each in metrics):.1%}" for name in ("accepted", "accepted_and_wrong")]
+        line.append(f"{mean(each['query_cpu_ms'] for each in metrics):.0f}")
+        table.append([*line, f"{row.trials[0]['map']['mib']:.2f}"])
+    return [Section("network_and_map", "Network and map", text, table)] if len(table) > 1 else []
 
 
 def _compared(name: str, axis: str, before: str, after: str, found: Sequence[Difference]) -> Section:

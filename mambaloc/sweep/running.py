@@ -139,10 +139,16 @@ def run_trial(command: tuple[str, ...], run: Path, time_limit_s: float, cpus: fl
 def _result(evaluation: Path) -> dict[str, Any]:
     """What ``metrics.json`` says, and under ``frames`` each frame's image and errors, to compare systems by."""
     result = json.loads((evaluation / "metrics.json").read_text(encoding="utf-8"))
-    with (evaluation / "predictions.csv").open(newline="", encoding="utf-8") as file:
+    if both := result.get("network_and_map"):
+        both["frames"] = _frames(evaluation / "predictions_both.csv")
+    return {**result, "frames": _frames(evaluation / "predictions.csv")}
+
+
+def _frames(predictions: Path) -> dict[str, Any]:
+    with predictions.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     errors = {name: [float(row[name]) for row in rows] for name in ("position_error_m", "rotation_error_deg")}
-    return {**result, "frames": {"image": [row["image"] for row in rows], **errors}}
+    return {"image": [row["image"] for row in rows], **errors}
 
 
 def _why(code: int, output: Path) -> str | None:

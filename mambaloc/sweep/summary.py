@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -57,7 +58,8 @@ class Row:
         test_frames: that its errors are over.
         data: dataset and scene, and whether they are the benchmark's own split.
         selection: how the epoch was chosen.
-        references: medians of answers that need no training, by name.
+        references: medians of answers that need no training, by name; a map's among them, which has no seeds.
+        both: a figure for each of ``ERRORS`` of the network and the map together; None where a seed was run without.
         trials: the results themselves, a seed each.
     """
 
@@ -71,6 +73,7 @@ class Row:
     data: str
     selection: str
     references: dict[str, dict[str, float]]
+    both: dict[str, Figure] | None
     trials: tuple[dict[str, Any], ...]
 
     @property
@@ -198,19 +201,34 @@ def _row(labels: dict[str, str], group: list[StoredTrial], epoch: str) -> Row:
     group = sorted(group, key=lambda trial: trial.labels.get(SEED, ""))
     results = [trial.results[epoch] for trial in group]
     first, rows = results[0], _resamples(results[0])
+    both = [result.get("network_and_map") for result in results]
     return Row(
         labels=labels,
         seeds=tuple(trial.labels.get(SEED, "") for trial in group),
-        errors={name: _figure([_medians(result, name, rows) for result in results]) for name in ERRORS},
+        errors=_figures(results, rows),
         train_s=tuple(result["training"]["wall_clock"]["train_s"] for result in results),
         steps=tuple(result["training"]["step"] for result in results),
         train_frames=first["training"]["data"]["train_frames"],
         test_frames=first["count"],
         data=data_label(first),
         selection=first["selection"],
-        references=first["references"],
+        references={**first["references"], **_map_alone(first)},
+        both=_figures([each for each in both if each], rows) if all(both) else None,
         trials=tuple(results),
     )
+
+
+def _figures(results: list[dict[str, Any]], rows: NDArray[np.int64]) -> dict[str, Figure]:
+    return {name: _figure([_medians(result, name, rows) for result in results]) for name in ERRORS}
+
+
+def _map_alone(result: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """Its medians, which JSON has as null where it found no pose in most frames."""
+    if "map" not in result:
+        return {}
+    of, medians = result["map"], {name: result["map"]["metrics"][name] for name in ERRORS}
+    name = f"map of {of['key_frames']} key frames, {of['width']} px"
+    return {name: {error: math.inf if each is None else each for error, each in medians.items()}}
 
 
 def _resamples(result: dict[str, Any]) -> NDArray[np.int64]:

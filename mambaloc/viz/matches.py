@@ -64,7 +64,7 @@ def look(localiser: MapLocaliser, image: Image, intrinsics: NDArray[np.float64])
     is_matched = np.zeros(len(features), bool)
     if np.isfinite(found.position_m).all():
         pose = CameraPose(matrix_from_quaternion(found.quaternion), found.position_m)
-        is_matched[localiser.matches(features, pose)[0]] = True
+        is_matched[localiser.matches(features, localiser.drift.to_adjusted(pose))[0]] = True
     scale = image.shape[1] / features.size[0]
     return Seen(image, (features.pixels + 0.5) * scale - 0.5, is_matched, found.is_accepted)
 

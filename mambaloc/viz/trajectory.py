@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,9 +16,12 @@ from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.viz.png import write_png
 
 TRUE_COLOR, PREDICTED_COLOR = "#1a9850", "#d73027"
+_FAINT_COLOR = "#9e9e9e"
 
 
-def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path, title: str) -> None:
+def draw_trajectory(
+    table: PoseErrorTable, sequences: Sequence[str], path: Path, title: str, network: PoseErrorTable | None = None
+) -> None:
     """Draw a split's true (green) and predicted (red) camera centres, and rotation errors below.
 
     Args:
@@ -25,22 +29,22 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
         sequences: each frame's sequence; lines do not cross from one to the next.
         path: the PNG to write.
         title: heads the plot, before the medians.
+        network: what the network by itself says of the same frames, drawn faintly behind the predictions.
     """
     figure = Figure(figsize=(7.0, 6.8), layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=(14, 1))
     axes = figure.add_subplot(grid[0], projection="3d")
-    true_m, predicted_m = table.true_position_m.cpu().numpy(), table.predicted_position_m.cpu().numpy()
+    true_m = table.true_position_m.cpu().numpy()
     names = np.array(sequences)[table.index.cpu().numpy()]
     for name in dict.fromkeys(names):
         rows = names == name
         axes.plot(*true_m[rows].T, color=TRUE_COLOR, linewidth=1.8)
-    for true, predicted in zip(true_m, predicted_m, strict=True):
-        axes.plot(*np.stack((true, predicted)).T, color=PREDICTED_COLOR, linewidth=0.4, alpha=0.35)
-    axes.scatter(*predicted_m.T, color=PREDICTED_COLOR, s=7, depthshade=False)
     axes.plot([], [], color=TRUE_COLOR, linewidth=1.8, label="ground truth")
-    axes.scatter([], [], [], color=PREDICTED_COLOR, s=7, label="prediction")
-    axes.legend(loc="upper center", ncols=2, frameon=False)
-    limits_m = box_around(table)
+    if network is not None:
+        _draw_predictions(axes, network, _FAINT_COLOR, "network alone")
+    _draw_predictions(axes, table, PREDICTED_COLOR, "prediction" if network is None else "network and map")
+    axes.legend(loc="upper center", ncols=3, frameon=False)
+    limits_m = box_around(table, *([] if network is None else [network]))
     axes.set(xlim=limits_m[0], ylim=limits_m[1], zlim=limits_m[2])
     for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", strict=True):
         axis.set_major_locator(MaxNLocator(5))
@@ -48,7 +52,8 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
         axis.labelpad = 8
     axes.set_box_aspect(np.ptp(limits_m, axis=1), zoom=1.08)
 
-    figure.suptitle(f"{title}\n{medians(table)} over {len(table.index)} frames", fontsize=12)
+    beside = "" if network is None else f"; network alone {medians(network).removeprefix('median ')}"
+    figure.suptitle(f"{title}\n{medians(table)} over {len(table.index)} frames{beside}", fontsize=12)
     bar = figure.add_subplot(grid[1])
     errors_deg = table.rotation_error_deg.cpu().numpy()
     top = round(max(1.0, float(np.percentile(errors_deg, 95))), 1)
@@ -58,10 +63,19 @@ def draw_trajectory(table: PoseErrorTable, sequences: Sequence[str], path: Path,
     write_png(figure, path)
 
 
-def box_around(table: PoseErrorTable) -> NDArray[np.floating]:
+def _draw_predictions(axes: Any, table: PoseErrorTable, color: str, label: str) -> None:
+    true_m, predicted_m = table.true_position_m.cpu().numpy(), table.predicted_position_m.cpu().numpy()
+    for true, predicted in zip(true_m, predicted_m, strict=True):
+        axes.plot(*np.stack((true, predicted)).T, color=color, linewidth=0.4, alpha=0.35)
+    axes.scatter(*predicted_m.T, color=color, s=7, depthshade=False, label=label)
+
+
+def box_around(*tables: PoseErrorTable) -> NDArray[np.floating]:
     """Where a plot of a split begins and ends along each axis: (3, 2), in metres."""
-    both_m = torch.cat((table.true_position_m, table.predicted_position_m)).cpu().numpy()
-    low_m, high_m = both_m.min(0), both_m.max(0)
+    all_m = torch.cat(
+        [m.cpu() for table in tables for m in (table.true_position_m, table.predicted_position_m)]
+    ).numpy()
+    low_m, high_m = all_m.min(0), all_m.max(0)
     half_m = np.maximum((high_m - low_m) / 2, 0.25 * (high_m - low_m).max())  # a flat path still gets a box to lie in
     return np.stack(((low_m + high_m) / 2 - half_m, (low_m + high_m) / 2 + half_m), axis=1)
 

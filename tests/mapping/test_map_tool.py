@@ -13,7 +13,6 @@ from mambaloc.mapping import evaluating
 from mambaloc.mapping.building import MapSettings
 from mambaloc.mapping.evaluating import MapErrors, build_and_measure
 from mambaloc.mapping.recipe import MapRecipe, read_recipe
-from mambaloc.rendering import embedded_room, embedded_walk, shots_of_sequences, write_7scenes
 from mambaloc.runtime.maps import SparseMap
 
 ROOT = Path(__file__).parents[2]
@@ -22,17 +21,6 @@ BLOCKS = ROOT / "recipes" / "map_redkitchen_blocks.yaml"
 
 def main(argv):
     runpy.run_path(str(ROOT / "tools" / "map.py"))["main"](argv)
-
-
-@pytest.fixture(scope="session")
-def den(made_once):
-    """A root with one scene, the embedded room in the 7-Scenes layout: 32 training and 6 test frames of 160x120."""
-
-    def render(root: Path) -> None:
-        walks = {number: embedded_walk(count, number, 0.0, 360 / count) for number, count in ((1, 32), (2, 6))}
-        write_7scenes(root, "den", shots_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
-
-    return made_once("den", render)
 
 
 def test_a_recipe_is_built_measured_and_written(den, tmp_path, capsys):

@@ -47,6 +47,20 @@ def result(system, gis, errors_m, retrieval_m=None, scene="redkitchen", official
     }
 
 
+def with_map(found, both_m, map_m=0.004, accepted=0.9):
+    """The same result with a map beside the network."""
+    both = np.array(both_m)
+    shares = {"accepted": accepted, "accepted_and_wrong": 0.01, "query_cpu_ms": 16.4}
+    of_both = {"metrics": {"position_error_worst_m": float(both.max()), **shares}}
+    of_both["frames"] = {
+        **found["frames"],
+        "position_error_m": both.tolist(),
+        "rotation_error_deg": (5 * both).tolist(),
+    }
+    of_map = {"metrics": {"position_error_m": map_m, "rotation_error_deg": 0.1}, "mib": 0.25, "key_frames": 80}
+    return {**found, "map": {**of_map, "width": 240}, "network_and_map": of_both}
+
+
 def stored(folder, told):
     """Keep results by their labels; None is a trial that failed."""
     with Store(folder) as store:
@@ -197,6 +211,45 @@ def test_the_files_say_the_same(store, tmp_path):
         path.stem for path in tmp_path.glob("report/tables/*.csv")
     }
     assert r"b|<i> & none & 0 & " in (tmp_path / "report/tables/results.tex").read_text()
+
+
+def test_a_map_beside_the_networks_is_reported_once_and_both_with_every_seed(tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "plots_of", lambda *_: [])
+    monkeypatch.setattr(report, "paper_tables", lambda *_: [])
+    hard = np.random.default_rng(0).gamma(4, 0.1, FRAMES)
+    told = {
+        ("a", "none", "0"): with_map(result("posenet", "none", hard), hard / 10, accepted=0.9),
+        ("a", "none", "1"): with_map(result("posenet", "none", hard + 0.1), hard / 10 + 0.02, accepted=0.8),
+        ("b", "none", "0"): with_map(result("posenet", "none", hard), hard),
+        ("b", "none", "1"): result("posenet", "none", hard),  # without a map: no row of both
+    }
+    write_report(stored(tmp_path / "results", told), tmp_path / "report")
+    tables = {}
+    for name in ("network_and_map", "references", "results"):
+        with (tmp_path / f"report/tables/{name}.csv").open(newline="") as file:
+            tables[name] = list(csv.reader(file))
+    header, line = tables["network_and_map"]
+    row = dict(zip(header, line, strict=True))
+    median = np.median(hard)
+    assert (row["system"], row["seeds"]) == ("a", "0 1")
+    assert float(row["network alone, median position (m)"]) == pytest.approx(median + 0.05, abs=6e-4)
+    assert float(row["network and map, median position (m)"]) == pytest.approx(median / 10 + 0.01, abs=6e-4)
+    assert float(row["network and map, median rotation (°)"]) == pytest.approx(median / 2 + 0.05, abs=6e-4)
+    assert float(row["from"]) < float(row["network and map, median rotation (°)"]) < float(row["to"])
+    assert float(row["worst (m)"]) == pytest.approx(hard.max() / 10 + 0.02, abs=6e-3)
+    assert (row["answered by the map"], row["of these wrong"]) == ("85.0%", "1.0%")
+    assert (row["CPU ms a picture"], row["map (MiB)"]) == ("16", "0.25")
+    answers = [line[2:] for line in tables["references"][1:]]
+    assert answers == [["map of 80 key frames, 240 px", "0.004", "0.100"]]  # once, whatever the network
+    assert [line[0] for line in tables["results"][1:]] == ["a", "b"]
+
+
+def test_a_map_that_found_no_pose_is_reported_as_infinite(tmp_path):
+    hard = np.random.default_rng(0).gamma(4, 0.1, FRAMES)
+    told = {("a", "none", "0"): with_map(result("posenet", "none", hard), hard, map_m=None)}
+    (row,) = rows_of(Store.ended(stored(tmp_path / "results", told)).values())
+    assert row.references["map of 80 key frames, 240 px"] == {"position_error_m": np.inf, "rotation_error_deg": 0.1}
+    assert row.both["position_error_m"].mean == pytest.approx(row.errors["position_error_m"].mean)
 
 
 def test_training_time_to_an_error_that_is_asked_for(store, tmp_path, monkeypatch):

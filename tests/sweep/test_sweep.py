@@ -1,5 +1,6 @@
 """Sweeps: what their trials are, and that every trial runs once, whatever happens meanwhile."""
 
+import json
 import signal
 import socket
 import sqlite3
@@ -155,6 +156,22 @@ def test_every_trial_runs_once(folder):
     assert [trial.labels["system"] for trial in kept.values()] == ["a", "a", "a", "b", "b", "b"]
     assert all(trial.results["last"]["metrics"] == {"position_error_m": 0.5} for trial in kept.values())
     assert all(trial.seconds > 0.2 for trial in kept.values())
+
+
+def test_frames_of_network_and_map_are_kept_beside_the_networks(tmp_path):
+    header = "image,position_error_m,rotation_error_deg"
+    (tmp_path / "metrics.json").write_text(json.dumps({"network_and_map": {"metrics": {"accepted": 0.5}}}))
+    (tmp_path / "predictions.csv").write_text(f"{header}\nseq-01/a.png,0.5,2\nseq-01/b.png,0.4,3\n")
+    (tmp_path / "predictions_both.csv").write_text(
+        f"{header},source\nseq-01/a.png,0.01,1,map\nseq-01/b.png,0.4,3,network\n"
+    )
+    result = running._result(tmp_path)
+    assert result["frames"]["position_error_m"] == [0.5, 0.4]
+    assert result["network_and_map"]["frames"] == {
+        **{"image": ["seq-01/a.png", "seq-01/b.png"], "position_error_m": [0.01, 0.4]},
+        "rotation_error_deg": [1.0, 3.0],
+    }
+    assert result["network_and_map"]["metrics"] == {"accepted": 0.5}
 
 
 def test_another_sweeps_trials_in_the_store_are_not_counted(folder):

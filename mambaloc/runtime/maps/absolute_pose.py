@@ -26,7 +26,7 @@ class CameraPose:
     @property
     def matrix(self) -> Floats:
         """(4, 4)."""
-        return np.block([[self.rotation, self.position_m[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+        return np.concatenate((np.column_stack((self.rotation, self.position_m)), [(0, 0, 0, 1)]))
 
     def project(self, points_m: Floats) -> tuple[Floats, Floats]:
         """Points (M, 3) in the plane at depth 1, (M, 2), and their depths (M,); NaN where these are not positive."""

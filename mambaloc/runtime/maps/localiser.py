@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb
 from mambaloc.runtime.maps.absolute_pose import CameraPose, ransac_pose, refine_pose
+from mambaloc.runtime.maps.drift import Drift
 from mambaloc.runtime.maps.features import (
     Features,
     check_intrinsics,
@@ -84,6 +85,8 @@ class MapLocaliser:
         self._often = np.argsort(-self._views.sum(axis=1), kind="stable")[:_AT_ONCE]
         self._unit_m = spread_m(sparse_map.key_poses)
         self._viewpoints = viewpoints(sparse_map.key_poses, self._unit_m)
+        drift = sparse_map.drift if len(sparse_map.drift) else np.zeros((len(sparse_map.key_poses), 6))
+        self.drift = Drift(sparse_map.key_poses[: len(drift)], drift)
 
     def localise(
         self, image: Image, intrinsics: ArrayLike | None = None, prior: CameraPose | None = None
@@ -107,14 +110,17 @@ class MapLocaliser:
         matrix = self._intrinsics(rgb) if intrinsics is None else np.asarray(intrinsics, np.float64)
         check_intrinsics(matrix, (rgb.shape[1], rgb.shape[0]))
         # So that things are as large as in the map's pictures, whatever the lens.
-        return detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0])
+        found = detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0])
+        return self.map.lens.straighten(found) if self._is_own_camera(found) else found
 
     def localise_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalisation:
-        """Localise a picture whose keypoints are found already."""
+        """Localise a picture whose keypoints :meth:`features` found."""
         near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
         best, is_clear = unambiguous(features.descriptors @ self._descriptors[self._often].T, _RATIO)
         rng = np.random.default_rng(self.seed)
-        pose = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], near, rng) or prior
+        pose = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], near, rng)
+        if pose is None and prior is not None:
+            pose = self.drift.to_adjusted(prior)
         if pose is None:
             return _nowhere()
         scale = near / 2  # of the refinement; finer where the matches are
@@ -129,6 +135,8 @@ class MapLocaliser:
         inliers = int((off <= near).sum())
         deviation_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])  # in the direction that is least sure
         is_accepted = inliers >= self.map.least_inliers and bool(deviation_m <= _MOST_DEVIATION * self._unit_m)
+        pose, unsure = self.drift.to_given(pose)
+        covariance = covariance + unsure
         return MapLocalisation(pose.position_m, quaternion_from_matrix(pose.rotation), inliers, is_accepted, covariance)
 
     def matches(self, features: Features, pose: CameraPose) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -163,6 +171,12 @@ class MapLocaliser:
         apart = ((self._viewpoints - viewpoints(pose.matrix[None], self._unit_m)) ** 2).sum(axis=1)
         nearest = np.argsort(apart, kind="stable")[:_NEAREST]
         return np.asarray(self._views[:, nearest].any(axis=1))
+
+    def _is_own_camera(self, features: Features) -> bool:
+        """Whether a picture claims to be of the map's camera, whose lens is known."""
+        width = self.map.size[0]
+        is_same = np.allclose(features.intrinsics, self.map.intrinsics, rtol=0, atol=0.01 * width)
+        return is_same and bool(np.allclose(features.size, self.map.size, rtol=0, atol=0.01 * width))
 
     def _intrinsics(self, image: Image) -> Floats:
         height, width = image.shape[:2]

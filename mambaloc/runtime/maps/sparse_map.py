@@ -17,6 +17,7 @@ from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
 from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.runtime.maps.features import check_intrinsics
+from mambaloc.runtime.maps.lens import Lens
 
 VERSION = 1
 MAP_FILE = "map.safetensors"
@@ -39,12 +40,16 @@ class SparseMap:
         points_m: what a camera sees.
         descriptors: how they look.
         views: which key frames see each.
-        key_poses: ``world_from_cam`` of the key frames.
+        key_poses: ``world_from_cam`` of the key frames, adjusted to the pictures as the points are.
         size: (width, height) of the pictures in which keypoints were searched.
         intrinsics: of their camera, of the first key frame where there are several.
         least_inliers: matches that a pose needs to be accepted.
         scene: name of the place.
         digests: of what the map was made from, by name.
+        lens: how the camera differs from ``intrinsics``.
+        drift: (K, 6), carries poses to the frame of the given ones, see
+            :func:`~mambaloc.runtime.maps.drift.fit_drift`; (0, 6) where that is the map's own. Key frames that were
+            added later have none.
         sessions: what was added later: how many key frames each has by its name, in the order of ``key_poses``, whose
             last they are.
     """
@@ -58,6 +63,8 @@ class SparseMap:
     least_inliers: int
     scene: str
     digests: dict[str, str] = field(default_factory=dict)
+    lens: Lens = field(default_factory=Lens)
+    drift: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     sessions: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -84,6 +91,8 @@ class SparseMap:
             "key_poses": self.key_poses,
             "size": np.array(self.size, np.int64),
             "intrinsics": self.intrinsics,
+            "lens": self.lens.numbers,
+            "drift": self.drift,
         }
         about = {
             "version": VERSION,
@@ -138,18 +147,21 @@ class SparseMap:
             raise ValueError(f"{counts} points, descriptors and views")
         if not len(key_poses) or arrays["views"].shape[1] != -(-len(key_poses) // 8):
             raise ValueError(f"{len(key_poses)} key frames in views of {arrays['views'].shape[1]} bytes")
-        if not all(np.isfinite(arrays[name]).all() for name in ("points_m", "key_poses")):
+        sessions = {str(name): int(count) for name, count in dict(about.get("sessions", {})).items()}
+        if any(count < 1 for count in sessions.values()) or sum(sessions.values()) >= len(key_poses):
+            raise ValueError(f"sessions of {sum(sessions.values())} of {len(key_poses)} key frames")
+        if len(arrays["drift"]) not in (0, len(key_poses) - sum(sessions.values())):
+            raise ValueError(f"drift of {len(arrays['drift'])} key frames of {len(key_poses)}")
+        if not all(np.isfinite(arrays[name]).all() for name in ("points_m", "key_poses", "lens", "drift")):
             raise ValueError("numbers are not finite")
         if not 0 < width <= LARGEST_SIDE_PX or not 0 < height <= LARGEST_SIDE_PX:
             raise ValueError(f"pictures of {width}x{height}")
         check_intrinsics(arrays["intrinsics"], (width, height))
-        sessions = {str(name): int(count) for name, count in dict(about.get("sessions", {})).items()}
-        if any(count < 1 for count in sessions.values()) or sum(sessions.values()) >= len(key_poses):
-            raise ValueError(f"sessions of {sum(sessions.values())} of {len(key_poses)} key frames")
         return cls(
             points, arrays["descriptors"], arrays["views"], key_poses, (width, height), arrays["intrinsics"],
             int(about["least_inliers"]), str(about["scene"]),
-            {str(name): str(digest) for name, digest in dict(about["digests"]).items()}, sessions,
+            {str(name): str(digest) for name, digest in dict(about["digests"]).items()},
+            Lens(*map(float, arrays["lens"])), arrays["drift"], sessions,
         )  # fmt: skip
 
 
@@ -160,6 +172,8 @@ _ARRAYS = {  # a side of 0 may have any length
     "key_poses": (np.float64, (0, 4, 4)),
     "size": (np.int64, (2,)),
     "intrinsics": (np.float64, (3, 3)),
+    "lens": (np.float64, (2,)),
+    "drift": (np.float64, (0, 6)),
 }
 
 

@@ -1,0 +1,157 @@
+"""Test frames localised in a sparse map: alone, and beside a network."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mambaloc.console import progress
+from mambaloc.data import Frames, PoseDataModule
+from mambaloc.errors import InputError, InputWarning
+from mambaloc.files import sha256
+from mambaloc.images import read_image
+from mambaloc.mapping.evaluating import MapErrors, with_cameras
+from mambaloc.metrics import PoseErrorTable
+from mambaloc.runtime.localisation import Localisation, combined
+from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
+from mambaloc.runtime.rotations import matrix_from_quaternion
+
+RUN_MAP = Path("map", MAP_FILE)
+"""Where a run keeps its map."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a map answers about test frames, or a network and a map together.
+
+    Args:
+        table: the answers and their errors, a row a frame.
+        is_accepted: which of them are poses that the map accepts, (N,).
+        cpu_s: CPU time that the map took on all cores, without decoding the picture, (N,).
+    """
+
+    table: PoseErrorTable
+    is_accepted: NDArray[np.bool_]
+    cpu_s: Floats
+
+    def summary(self) -> dict[str, float]:
+        """As :meth:`mambaloc.mapping.evaluating.MapErrors.summary`."""
+        errors = (self.table.position_error_m.numpy(), self.table.rotation_error_deg.numpy())
+        return MapErrors(*errors, self.is_accepted, self.cpu_s).summary()
+
+
+@dataclass(frozen=True)
+class MeasuredMap:
+    """A sparse map, and test frames that were localised in it alone; :func:`measure_map` makes it.
+
+    Args:
+        path: the map's file.
+        localiser: in the map.
+        frames: of the test split.
+        intrinsics: of each frame, (N, 3, 3).
+        alone: the map's answers, accepted or not.
+    """
+
+    path: Path
+    localiser: MapLocaliser
+    frames: Frames
+    intrinsics: Floats
+    alone: Answers
+
+    def beside(self, network: PoseErrorTable) -> Answers:
+        """Localise each frame around a network's pose, which is the answer where the map's is not accepted.
+
+        Args:
+            network: its answers about the same frames.
+        """
+        poses = (network.predicted_position_m.cpu().numpy(), network.predicted_quaternion.cpu().numpy())
+        said = [Localisation(position_m, quaternion, 0.0) for position_m, quaternion in zip(*poses, strict=True)]
+        priors = [CameraPose(matrix_from_quaternion(each.quaternion), each.position_m) for each in said]
+        found, cpu_s = _localise(self.localiser, self.frames, self.intrinsics, priors)
+        answers = [combined(*both) for both in zip(said, found, strict=True)]
+        is_accepted = np.array([answer.source == "map" for answer in answers])
+        return Answers(_table(answers, self.frames), is_accepted, cpu_s)
+
+    def describe(self) -> dict[str, Any]:
+        """Which map it is, and how it answered."""
+        of = self.localiser.map
+        return {
+            "metrics": self.alone.summary(),
+            "points": len(of),
+            "key_frames": len(of.key_poses),
+            "width": of.size[0],
+            "mib": self.path.stat().st_size / 2**20,
+            "sha256": sha256(self.path),
+            "digests": of.digests,
+            "ransac_seed": self.localiser.seed,
+        }
+
+
+def measure_map(path: Path, data: PoseDataModule) -> MeasuredMap:
+    """Localise every test frame in a map.
+
+    Args:
+        path: the map's file.
+        data: the scene.
+
+    Raises:
+        InputError: for a map that cannot be read, frames that are missing or bad, or whose cameras are unknown.
+    """
+    data.setup("test")
+    frames, localiser = data.frames("test"), MapLocaliser(SparseMap.load(path))
+    intrinsics = with_cameras(data.hparams["dataset"], data.folder, frames).intrinsics
+    found, cpu_s = _localise(localiser, frames, intrinsics, [None] * len(frames))
+    is_accepted = np.array([each.is_accepted for each in found])
+    return MeasuredMap(path, localiser, frames, intrinsics, Answers(_table(found, frames), is_accepted, cpu_s))
+
+
+def measure_map_of_run(run: Path, data: PoseDataModule) -> MeasuredMap | None:
+    """Localise every test frame in a run's map; None without one, or, with a warning, where it cannot be used.
+
+    Raises:
+        InputError: for frames that are missing or bad.
+    """
+    path = run / RUN_MAP
+    if not path.is_file():
+        return None
+    data.setup("test")
+    try:
+        return measure_map(path, data)
+    except InputError as error:
+        warnings.warn(f"{error} The network is measured without the map.", InputWarning, stacklevel=2)
+        return None
+
+
+def _localise(
+    localiser: MapLocaliser, frames: Frames, intrinsics: Floats, priors: Sequence[CameraPose | None]
+) -> tuple[list[MapLocalisation], Floats]:
+    found, cpu_s = [], []
+    rows = zip(frames.image_paths, intrinsics, priors, strict=True)
+    for path, matrix, prior in progress(rows, "in the map", len(frames)):
+        rgb, start = read_image(path), time.process_time()
+        found.append(localiser.localise(rgb, matrix, prior))
+        cpu_s.append(time.process_time() - start)
+    return found, np.array(cpu_s)
+
+
+def _table(answers: Sequence[MapLocalisation | Localisation], frames: Frames) -> PoseErrorTable:
+    """Poses and their errors, which are infinite where there is no pose."""
+    poses = (np.array([each.position_m for each in answers]), np.array([each.quaternion for each in answers]))
+    tensors = (torch.from_numpy(each.astype(np.float64)) for each in (*poses, frames.position_m, frames.quaternion))
+    table = PoseErrorTable.of(torch.arange(len(frames)), *tensors)
+    return replace(
+        table,
+        position_error_m=table.position_error_m.nan_to_num(nan=math.inf),
+        rotation_error_deg=table.rotation_error_deg.nan_to_num(nan=math.inf),
+    )

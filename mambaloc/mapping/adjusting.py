@@ -1,0 +1,202 @@
+"""Bundle adjustment: poses, points and a lens that agree with the pictures, held near what was given.
+
+Given poses drift, so that no points fit all pictures that were posed with them. Adjusted poses do. How far each moved
+is the drift, and :mod:`mambaloc.runtime.maps.drift` carries answers back to the frame of the given poses. From pictures
+alone small baselines would bend the map, so the given poses and the given camera are priors.
+
+Levenberg-Marquardt on the reduced camera system (Triggs et al. 2000, section 6.1): points are eliminated, and one dense
+system of six unknowns a camera and two of the lens is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.mapping.triangulation import Observations
+from mambaloc.runtime.maps.lens import Lens
+from mambaloc.runtime.maps.viewpoints import spread_m
+
+Floats = NDArray[np.floating[Any]]
+
+_STEPS = 12
+_CONVERGED = 1e-3  # of the cost
+_DAMPING, _MOST_DAMPING = 1e-4, 1e4
+_AT_ONCE = 512  # points that are eliminated together
+# One standard deviation of the priors.
+_MOVE = 0.05  # of the cameras' spread: 3 cm in a room that is filmed from its middle
+_TURN_RAD = np.radians(1.0)
+_FOCAL, _RADIAL = 0.02, 0.05
+_FIXED = 1e-9
+_LEAST_DEPTH = 1e-3  # of the cameras' spread
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """What is adjusted.
+
+    Shape:
+        ``world_from_cam`` (N, 4, 4); ``points_m`` (T, 3).
+    """
+
+    world_from_cam: Floats
+    points_m: Floats
+    lens: Lens
+
+    def moved(self, cameras: Floats, points_m: Floats, lens: Floats) -> Bundle:
+        """Shift and turn cameras about the world's axes (N, 6), shift points (T, 3), and change the lens (2,)."""
+        poses = self.world_from_cam.copy()
+        poses[:, :3, 3] += cameras[:, :3]
+        poses[:, :3, :3] = np.stack([cv2.Rodrigues(turn)[0] for turn in cameras[:, 3:]]) @ poses[:, :3, :3]
+        return Bundle(poses, self.points_m + points_m, Lens(*(self.lens.numbers + lens)))
+
+
+def adjust(
+    start: Bundle,
+    given: Floats,
+    seen: Observations,
+    sigma: float,
+    is_lens_free: bool,
+    is_fixed: NDArray[np.bool_] | None = None,
+    looseness: float = 1.0,
+) -> Bundle:
+    """Move cameras, points and the lens to where points project to what is seen, with Cauchy's weights.
+
+    Args:
+        start: the points are the tracks of ``seen``.
+        given: ``world_from_cam`` (N, 4, 4), from which a camera may differ by 5 % of the cameras' spread and 1 degree,
+            one standard deviation.
+        seen: rays as the claimed intrinsics have them.
+        sigma: an observation that is off by so much, in the plane at depth 1, has half the weight.
+        is_lens_free: whether the lens is adjusted.
+        is_fixed: points that stay where they are, (T,); none unless given.
+        looseness: times how far a camera may differ.
+    """
+    problem = _Problem(given, seen, sigma, is_lens_free, looseness)
+    if is_fixed is not None:
+        problem.is_fixed = is_fixed[seen.track]
+    now, cost, damping = start, problem.cost(start), _DAMPING
+    for _ in range(_STEPS):
+        equations = problem.linearized(now)
+        new_cost = np.inf
+        while new_cost >= cost and damping < _MOST_DAMPING:
+            new = now.moved(*equations.solve(damping))
+            new_cost, damping = problem.cost(new), damping * 10
+        if new_cost >= cost:
+            break
+        has_converged = cost - new_cost <= _CONVERGED * cost
+        now, cost, damping = new, new_cost, damping / 100
+        if has_converged:
+            break
+    return now
+
+
+class _Problem:
+    """Observations and priors, both in units of their standard deviations."""
+
+    def __init__(self, given: Floats, seen: Observations, sigma: float, is_lens_free: bool, looseness: float) -> None:
+        self.given, self.seen, self.sigma = given, seen, sigma
+        self.is_fixed = np.zeros(len(seen), bool)
+        self.unit = spread_m(given)
+        camera = looseness * np.repeat((_MOVE * self.unit, _TURN_RAD), 3)
+        lens = np.array((_FOCAL, _RADIAL)) * (1 if is_lens_free else _FIXED)
+        self.prior = np.concatenate((np.tile(camera, len(given)), lens)) ** -2.0
+        self.first = np.searchsorted(seen.track, np.arange(seen.track[-1] + 1))
+
+    def cost(self, at: Bundle) -> float:
+        off = self._project(at)[0]
+        return float(np.log1p((off**2).sum(axis=1)).sum() + (self.moves(at) ** 2 * self.prior).sum())
+
+    def moves(self, at: Bundle) -> Floats:
+        """How far cameras and the lens are from where they were given, (6 N + 2,)."""
+        turns = at.world_from_cam[:, :3, :3] @ self.given[:, :3, :3].transpose(0, 2, 1)
+        turned = [cv2.Rodrigues(turn)[0][:, 0] for turn in turns]
+        cameras = np.hstack((at.world_from_cam[:, :3, 3] - self.given[:, :3, 3], turned))
+        return np.concatenate((cameras.ravel(), at.lens.numbers - Lens().numbers))
+
+    def _project(self, at: Bundle) -> tuple[Floats, Floats, Floats, Floats]:
+        """Residuals (O, 2), from cameras to points in the world (O, 3), ideal rays (O, 2), and depths (O, 1)."""
+        towards = at.points_m[self.seen.track] - at.world_from_cam[self.seen.frame, :3, 3]
+        cam = np.einsum("oji,oj->oi", at.world_from_cam[self.seen.frame, :3, :3], towards)
+        depth = np.maximum(cam[:, 2:], _LEAST_DEPTH * self.unit)
+        ideal = cam[:, :2] / depth
+        return (at.lens.distort(ideal) - self.seen.rays) / self.sigma, towards, ideal, depth
+
+    def linearized(self, at: Bundle) -> _Equations:
+        """Normal equations at a bundle."""
+        off, towards, ideal, depth = self._project(at)
+        weight = 1 / np.sqrt(1 + (off**2).sum(axis=1))[:, None, None]
+        inverse = at.world_from_cam[self.seen.frame, :3, :3].transpose(0, 2, 1)
+        by_ray, by_lens = at.lens.slopes(ideal)
+        by_point = by_ray @ (inverse[:, :2] - ideal[..., None] * inverse[:, 2:]) / depth[..., None]
+        # A turn by θ about the world's axes moves a point, as the camera sees it, by -θ x towards.
+        by_camera = np.concatenate((-by_point, by_point @ _cross(towards)), axis=-1)
+        by_camera, by_lens, by_point = (weight / self.sigma * each for each in (by_camera, by_lens, by_point))
+        by_point[self.is_fixed] = 0
+        return _Equations(self, by_camera, by_lens, by_point, weight * off[..., None], self.moves(at))
+
+
+class _Equations:
+    """Normal equations in blocks: ``normal`` and ``right`` of cameras and lens, the rest of points."""
+
+    def __init__(
+        self, problem: _Problem, by_camera: Floats, by_lens: Floats, by_point: Floats, off: Floats, moves: Floats
+    ) -> None:
+        self.frame, self.track, self.first = problem.seen.frame, problem.seen.track, problem.first
+        self.cameras = len(problem.given)
+        self.normal = np.diag(problem.prior)
+        self.right = problem.prior * moves
+        pose, lens = np.arange(6 * self.cameras).reshape(-1, 6), 6 * self.cameras + np.arange(2)
+        rows, columns = pose[self.frame][..., None], pose[self.frame][:, None]
+        np.add.at(self.normal, (rows, columns), _t(by_camera) @ by_camera)
+        np.add.at(self.normal, (rows, lens[None, None]), _t(by_camera) @ by_lens)
+        np.add.at(self.right, pose[self.frame], (_t(by_camera) @ off)[..., 0])
+        self.normal[lens[0] :, : lens[0]] = self.normal[: lens[0], lens[0] :].T
+        self.normal[np.ix_(lens, lens)] += (_t(by_lens) @ by_lens).sum(axis=0)
+        self.right[lens] += (_t(by_lens) @ off).sum(axis=0)[:, 0]
+        self.camera_point = _t(by_camera) @ by_point
+        self.lens_point = np.add.reduceat(_t(by_lens) @ by_point, self.first)
+        self.point_normal = np.add.reduceat(_t(by_point) @ by_point, self.first)
+        self.point_right = np.add.reduceat(_t(by_point) @ off, self.first)
+
+    def solve(self, damping: float) -> tuple[Floats, Floats, Floats]:
+        """Steps of cameras (N, 6), points (T, 3) and the lens (2,)."""
+        trace = np.trace(self.point_normal, axis1=1, axis2=2)
+        inverse = np.linalg.inv(self.point_normal + (damping * trace + 1e-9)[:, None, None] * np.eye(3))
+        root = np.linalg.cholesky(inverse)
+        normal = self.normal + damping * np.diag(np.diag(self.normal))
+        right = self.right.copy()
+        for start in range(0, len(root), _AT_ONCE):
+            mixed = self._mixed(start, root)
+            normal -= mixed @ mixed.T
+            right -= mixed @ (_t(root[start : start + _AT_ONCE]) @ self.point_right[start : start + _AT_ONCE]).ravel()
+        step = -np.linalg.solve(normal, right)
+        cameras, lens = step[:-2].reshape(-1, 6), step[-2:]
+        pull = np.add.reduceat(_t(self.camera_point) @ cameras[self.frame][..., None], self.first)
+        pull += _t(self.lens_point) @ lens[:, None]
+        return cameras, -(inverse @ (self.point_right + pull))[..., 0], lens
+
+    def _mixed(self, start: int, root: Floats) -> Floats:
+        """Cameras and lens by some points, times a root of the points' inverse, (6 N + 2, 3 * points)."""
+        count = min(_AT_ONCE, len(root) - start)
+        rows = slice(*np.searchsorted(self.track, (start, start + count)))
+        mixed = np.zeros((self.cameras, count, 6, 3))
+        np.add.at(mixed, (self.frame[rows], self.track[rows] - start), self.camera_point[rows] @ root[self.track[rows]])
+        lens = self.lens_point[start : start + count] @ root[start : start + count]
+        cameras = mixed.transpose(0, 2, 1, 3).reshape(6 * self.cameras, -1)
+        return np.concatenate((cameras, lens.transpose(1, 0, 2).reshape(2, -1)))
+
+
+def _t(matrices: Floats) -> Floats:
+    return matrices.swapaxes(-1, -2)
+
+
+def _cross(vectors: Floats) -> Floats:
+    """Matrices (O, 3, 3) that take the cross product with vectors from the left."""
+    matrices = np.zeros((len(vectors), 3, 3))
+    matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
+    return matrices - _t(matrices)

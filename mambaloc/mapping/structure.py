@@ -1,0 +1,140 @@
+"""Structure from matches between posed frames: tracks, points, and poses that agree with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.mapping.adjusting import Bundle, adjust
+from mambaloc.mapping.tracks import agreeing, connected
+from mambaloc.mapping.triangulation import Observations, triangulate
+from mambaloc.runtime.maps.features import Features
+from mambaloc.runtime.maps.lens import Lens
+
+Floats = NDArray[np.floating[Any]]
+Indices = NDArray[np.int64]
+
+# How far a match may be from its epipolar line, and a point from where it is seen, in pixels of a picture of 160: by
+# round, with the poses as given, which drift by that much, and with adjusted ones.
+_NEAR_PX = (4.0, 2.0)
+_SIGMA_PX = 0.5
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Points, where frames see them, and the poses and lens that both agree with.
+
+    Shape:
+        ``world_from_cam`` (N, 4, 4); ``points_m`` (P, 3); ``descriptors`` (P, 128), means of unit length; ``views``
+        (P, N), which frames see each.
+
+    Args:
+        agreeing: share of the matches that agree with the given poses.
+    """
+
+    world_from_cam: Floats
+    lens: Lens
+    points_m: Floats
+    descriptors: NDArray[np.float32]
+    views: NDArray[np.bool_]
+    agreeing: float
+
+
+def recover_structure(
+    features: Sequence[Features],
+    given: Floats,
+    pairs: Indices,
+    matches: Sequence[Indices],
+    rng: np.random.Generator,
+) -> Structure:
+    """Triangulate with the given poses, adjust poses and lens, and triangulate again.
+
+    Args:
+        features: of each frame.
+        given: ``world_from_cam``, (N, 4, 4).
+        pairs: of frames that were matched, (E, 2).
+        matches: rows of keypoints of both frames of each pair.
+        rng: draws views.
+    """
+    unit_px = features[0].size[0] / 160
+    focal_px = features[0].intrinsics[0, 0]
+    is_one_camera = all(np.allclose(each.intrinsics, features[0].intrinsics) for each in features)
+    poses, lens, share = given, Lens(), np.nan
+    for near_px in _NEAR_PX:
+        is_first = near_px == _NEAR_PX[0]
+        points, seen, keypoint, kept = triangulated(features, poses, pairs, matches, near_px * unit_px, rng)
+        share = kept / max(sum(len(each) for each in matches), 1) if is_first else share
+        if not len(points):
+            break
+        sigma = _SIGMA_PX * unit_px / focal_px
+        bundle = adjust(Bundle(poses, points, Lens()), given, seen, sigma, is_first and is_one_camera)
+        poses = bundle.world_from_cam
+        if is_first:
+            lens = bundle.lens
+            features = [lens.straighten(each) for each in features]
+    points, seen, keypoint, _ = triangulated(features, poses, pairs, matches, _NEAR_PX[-1] * unit_px, rng)
+    return Structure(poses, lens, points, *mean_descriptors(features, len(points), seen, keypoint), share)
+
+
+def mean_descriptors(
+    features: Sequence[Features], points: int, seen: Observations, keypoint: Indices
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Descriptors of points, (P, 128), means of unit length, and which frames see each, (P, N)."""
+    mean = np.zeros((points, features[0].descriptors.shape[1]), np.float32)
+    np.add.at(mean, seen.track, np.concatenate([each.descriptors for each in features])[keypoint])
+    views = np.zeros((points, len(features)), bool)
+    views[seen.track, seen.frame] = True
+    return mean / np.linalg.norm(mean, axis=1, keepdims=True), views
+
+
+def triangulated(
+    features: Sequence[Features],
+    world_from_cam: Floats,
+    pairs: Indices,
+    matches: Sequence[Indices],
+    near_px: float,
+    rng: np.random.Generator,
+) -> tuple[Floats, Observations, Indices, int]:
+    """Triangulate, and once more what the first points leave of their tracks, where two points were taken for one.
+
+    Returns:
+        Points (P, 3), where they are seen (their rows are the tracks), which of all frames' keypoints each observation
+        is, and how many matches agreed with the poses.
+    """
+    cam_from_world = np.linalg.inv(world_from_cam)
+    kept = [agreeing(features, cam_from_world, *each, near_px) for each in zip(pairs, matches, strict=True)]
+    seen, keypoint = _tracks(features, pairs, kept, near_px)
+    found: list[Floats] = []
+    observed, keypoints = [], []
+    for _ in range(2):
+        points, is_point, agrees = triangulate(cam_from_world, seen, rng)
+        used = agrees & is_point[seen.track]
+        row = np.cumsum(is_point) - 1 + sum(len(each) for each in found)
+        observed.append((seen.frame[used], row[seen.track[used]], seen.rays[used], seen.near[used]))
+        keypoints.append(keypoint[used])
+        found.append(points[is_point])
+        left = ~used
+        left &= np.bincount(seen.track[left], minlength=len(points))[seen.track] >= 2
+        seen, keypoint = seen.select(left).renumbered(), keypoint[left]
+    whole = Observations(*(np.concatenate(each) for each in zip(*observed, strict=True)))
+    return np.concatenate(found), whole, np.concatenate(keypoints), sum(len(each) for each in kept)
+
+
+def _tracks(
+    features: Sequence[Features], pairs: Indices, matches: Sequence[Indices], near_px: float
+) -> tuple[Observations, Indices]:
+    """Keypoints that matches connect, and which each is, of all frames' laid end to end (O,)."""
+    first = np.cumsum([0, *(len(each) for each in features)])
+    linked = [rows + first[pair] for pair, rows in zip(pairs, matches, strict=True)]
+    edges = np.concatenate([np.empty((0, 2), np.int64), *linked])
+    root = connected(first[-1], edges)
+    keypoint = np.unique(edges)
+    keypoint = keypoint[np.argsort(root[keypoint], kind="stable")]
+    frame = np.searchsorted(first, keypoint, side="right") - 1
+    rays = np.concatenate([each.rays for each in features])
+    focal_px = np.array([each.intrinsics[0, 0] for each in features])
+    return Observations(frame, root[keypoint], rays[keypoint], near_px / focal_px[frame]).renumbered(), keypoint

@@ -1,0 +1,87 @@
+"""The drift of the poses that a map was given: how far they are, by viewpoint, from poses that fit the pictures.
+
+A map's points and key frames are adjusted to the pictures. How far each key frame moved is known, and drift is smooth:
+a Gaussian process over viewpoints carries any pose from the map's adjusted frame to the frame of the given poses, and
+says how sure that is (Rasmussen and Williams 2006, equations 2.23 and 2.24).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.runtime.maps.absolute_pose import CameraPose
+from mambaloc.runtime.maps.viewpoints import spread_m, viewpoints
+
+Floats = NDArray[np.floating[Any]]
+
+# Chosen on held-out blocks of a real room: longer is as good, shorter forgets the trend between distant key frames.
+_LENGTH = 8.0  # of the kernel, in units of viewpoints
+_NUGGET = 1e-3  # variance of a single key frame's move, over that of the drift
+
+
+def fit_drift(adjusted: Floats, given: Floats) -> NDArray[np.float64]:
+    """Weights of key frames in the drift.
+
+    Args:
+        adjusted: ``world_from_cam`` of key frames as they fit the pictures, (K, 4, 4).
+        given: the same as they were given.
+
+    Returns:
+        (K, 6): of shifts in metres and turns in radians, both along the camera's axes.
+    """
+    inverse = adjusted[:, :3, :3].transpose(0, 2, 1)
+    shifts = (inverse @ (given[:, :3, 3] - adjusted[:, :3, 3])[..., None])[..., 0]
+    turns = [cv2.Rodrigues(turn)[0][:, 0] for turn in inverse @ given[:, :3, :3]]
+    places = viewpoints(adjusted, spread_m(adjusted))
+    weights = np.linalg.solve(_kernel(places, places) + _NUGGET * np.eye(len(places)), np.hstack((shifts, turns)))
+    return np.asarray(weights, np.float64)
+
+
+class Drift:
+    """Carry poses between the adjusted frame of a map and the frame of the poses that it was given.
+
+    Args:
+        key_poses: adjusted ``world_from_cam``, (K, 4, 4).
+        weights: of :func:`fit_drift`, (K, 6).
+    """
+
+    def __init__(self, key_poses: Floats, weights: Floats) -> None:
+        self._unit_m = spread_m(key_poses)
+        self._places = viewpoints(key_poses, self._unit_m)
+        self._weights = weights
+        covariance = _kernel(self._places, self._places) + _NUGGET * np.eye(len(key_poses))
+        self._inverse = np.linalg.inv(covariance)
+        self._amplitude = weights.T @ covariance @ weights / len(weights)  # most likely, (6, 6)
+
+    def to_given(self, pose: CameraPose) -> tuple[CameraPose, Floats]:
+        """Carry a pose from the adjusted frame to that of the given poses.
+
+        Returns:
+            The pose, and the covariance (6, 6) of what was added, in the order and axes of
+            :func:`~mambaloc.runtime.maps.absolute_pose.refine_pose`.
+        """
+        near = self._near(pose)
+        shift, turn = np.split(near @ self._weights, 2)
+        carried = CameraPose(pose.rotation @ cv2.Rodrigues(turn)[0], pose.position_m + pose.rotation @ shift)
+        axes = np.kron(np.eye(2), pose.rotation)
+        unsure = max(1 + _NUGGET - float(near @ self._inverse @ near), 0.0)
+        return carried, unsure * axes @ self._amplitude @ axes.T
+
+    def to_adjusted(self, pose: CameraPose) -> CameraPose:
+        """Carry a pose back, to first order: drift hardly differs between the two."""
+        shift, turn = np.split(self._near(pose) @ self._weights, 2)
+        rotation = pose.rotation @ cv2.Rodrigues(-turn)[0]
+        return CameraPose(rotation, pose.position_m - rotation @ shift)
+
+    def _near(self, pose: CameraPose) -> Floats:
+        return _kernel(viewpoints(pose.matrix[None], self._unit_m), self._places)[0]
+
+
+def _kernel(places: Floats, others: Floats) -> Floats:
+    """Matérn's covariance of smoothness 3/2, (M, 6) and (N, 6) to (M, N)."""
+    apart = np.sqrt(3 * ((places[:, None] - others) ** 2).sum(axis=-1)) / _LENGTH
+    return np.asarray((1 + apart) * np.exp(-apart))
