@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mambaloc.mapping.adjusting import Bundle, adjust
 from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.structure import mean_descriptors, triangulated
-from mambaloc.mapping.tracks import agreeing, match
+from mambaloc.mapping.tracks import agreeing
 from mambaloc.mapping.triangulation import Observations
 from mambaloc.runtime.maps import CameraPose, MapLocaliser
 from mambaloc.runtime.maps.features import Features
@@ -46,22 +46,27 @@ class Extension:
 
 
 def extend(
-    localiser: MapLocaliser, features: Sequence[Features], world_from_cam: Floats, given: Floats | None
+    localiser: MapLocaliser,
+    features: Sequence[Features],
+    matched: Callable[[int, int], Indices],
+    world_from_cam: Floats,
+    given: Floats | None,
 ) -> Extension:
     """Adjust the poses of new key frames to the map's points, which stay, and to points that they see together.
 
     Args:
         localiser: in the map.
         features: of each new key frame.
+        matched: rows of keypoints that match between two of them, (M, 2).
         world_from_cam: where the map found it, (N, 4, 4).
         given: the same from elsewhere, a prior; None where that is not known.
     """
     sparse_map, rng, poses = localiser.map, np.random.default_rng(0), world_from_cam
     unit_px, focal_px = sparse_map.size[0] / 160, sparse_map.intrinsics[0, 0]
     for near_px in _NEAR_PX:
-        known, rest = _known(localiser, features, poses, near_px * unit_px / focal_px)
-        pairs, matches = _pairs(rest, poses, near_px * unit_px)
-        points_m, seen, keypoint, _ = triangulated(rest, poses, pairs, matches, near_px * unit_px, rng)
+        known, is_known = _known(localiser, features, poses, near_px * unit_px / focal_px)
+        pairs, matches = _pairs(features, matched, is_known, poses, near_px * unit_px)
+        points_m, seen, keypoint, _ = triangulated(features, poses, pairs, matches, near_px * unit_px, rng)
         if near_px != _NEAR_PX[-1] and len(poses) > 1:
             both, tracks = _joined(known, seen, len(sparse_map))
             every_m = np.concatenate((sparse_map.points_m, points_m))[tracks]
@@ -70,7 +75,7 @@ def extend(
             if prior is None:
                 prior, looseness = poses, _LOOSE
             poses = adjust(start, prior, both, sigma, False, is_fixed, looseness).world_from_cam
-    descriptors, views = mean_descriptors(rest, len(points_m), seen, keypoint)
+    descriptors, views = mean_descriptors(features, len(points_m), seen, keypoint)
     order = np.argsort(-views.sum(axis=1), kind="stable")
     old = np.zeros((len(sparse_map), len(features)), bool)
     old[known.track, known.frame] = True
@@ -79,27 +84,34 @@ def extend(
 
 def _known(
     localiser: MapLocaliser, features: Sequence[Features], world_from_cam: Floats, near: float
-) -> tuple[Observations, list[Features]]:
-    """What frames see of the map, whose points are the tracks, and the rest of their keypoints."""
-    found, rest = [], []
+) -> tuple[Observations, list[NDArray[np.bool_]]]:
+    """What frames see of the map, whose points are the tracks, and which of their keypoints these are."""
+    found, is_known = [], [np.zeros(len(each), bool) for each in features]
     for row, (each, pose) in enumerate(zip(features, world_from_cam, strict=True)):
         keypoints, points = localiser.matches(each, CameraPose(pose[:3, :3], pose[:3, 3]))
         found.append((np.full(len(points), row), points, each.rays[keypoints]))
-        rest.append(each.select(np.setdiff1d(np.arange(len(each)), keypoints)))
+        is_known[row][keypoints] = True
     frame, track, rays = (np.concatenate(each) for each in zip(*found, strict=True))
     order = np.argsort(track, kind="stable")
-    return Observations(frame[order], track[order], rays[order], np.full(len(order), near)), rest
+    return Observations(frame[order], track[order], rays[order], np.full(len(order), near)), is_known
 
 
-def _pairs(features: Sequence[Features], world_from_cam: Floats, near_px: float) -> tuple[Indices, list[Indices]]:
-    """Pairs of frames and their matches, but for pairs whose matches mostly disagree with the poses."""
+def _pairs(
+    features: Sequence[Features],
+    matched: Callable[[int, int], Indices],
+    is_known: Sequence[NDArray[np.bool_]],
+    world_from_cam: Floats,
+    near_px: float,
+) -> tuple[Indices, list[Indices]]:
+    """Pairs of frames and their new matches, but for pairs whose matches mostly disagree with the poses."""
     pairs, matches = [], []
     cam_from_world = np.linalg.inv(world_from_cam)
-    for pair in pairs_by_pose(world_from_cam):
-        rows = match(features[pair[0]], features[pair[1]])
-        if len(agreeing(features, cam_from_world, pair, rows, near_px)) > _LEAST_AGREEING * len(rows):
-            pairs.append(pair)
-            matches.append(rows)
+    for first, second in pairs_by_pose(world_from_cam).tolist():
+        rows = matched(first, second)
+        agree = agreeing(features, cam_from_world, np.array((first, second)), rows, near_px)
+        if len(agree) > _LEAST_AGREEING * len(rows):
+            pairs.append((first, second))
+            matches.append(agree[~is_known[first][agree[:, 0]] & ~is_known[second][agree[:, 1]]])
     return np.array(pairs, np.int64).reshape(-1, 2), matches
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from mambaloc.errors import InputError
 from mambaloc.mapping.extending import extend
 from mambaloc.mapping.keyframes import farthest_first
+from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
 from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.viewpoints import spread_m
@@ -85,6 +87,7 @@ def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, 
     """
     if session in sparse_map.sessions:
         raise InputError(f"{session}: was added before. Remove that first, or add these under another --name.")
+    matched = functools.cache(lambda first, second: match(frames[first].features, frames[second].features))
     poses: dict[int, CameraPose] = {}
     grown, rounds, contradict = sparse_map, 0, 0
     key: list[int] = []
@@ -94,7 +97,7 @@ def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, 
         if not found:
             break
         poses |= found
-        grown, key = _grown(sparse_map, frames, poses, session, most)
+        grown, key = _grown(sparse_map, frames, matched, poses, session, most)
     if not poses:
         raise InputError(_why_none(session, len(frames), contradict))
     lost = [frame.name for row, frame in enumerate(frames) if row not in poses]
@@ -146,7 +149,12 @@ def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -
 
 
 def _grown(
-    sparse_map: SparseMap, frames: Sequence[NewFrame], poses: dict[int, CameraPose], session: str, most: int
+    sparse_map: SparseMap,
+    frames: Sequence[NewFrame],
+    matched: Callable[[int, int], NDArray[np.int64]],
+    poses: dict[int, CameraPose],
+    session: str,
+    most: int,
 ) -> tuple[SparseMap, list[int]]:
     """The map with frames whose poses are known, and which became key frames; their poses are adjusted in place."""
     rows = np.array(sorted(poses))
@@ -156,6 +164,7 @@ def _grown(
     new = extend(
         localiser,
         [frames[row].features for row in key],
+        lambda first, second: matched(key[first], key[second]),
         np.stack([poses[row].matrix for row in key]),
         np.stack(given) if len(given) == len(key) else None,
     )
