@@ -51,7 +51,7 @@ def decode_image(data: bytes, upright: bool = True) -> Image | str:
         image = None
     if image is None:
         return "image cannot be decoded"
-    return image[..., ::-1]  # type: ignore[return-value]
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[return-value]
 
 
 def read_image(path: str | Path) -> Image:

@@ -1,4 +1,4 @@
-"""Data that every test may use: a tiny rendered scene, small recipes, and what trainings and exports of them leave.
+"""Data that every test may use: tiny rendered scenes, small recipes, and what trainings and exports of them leave.
 
 What costs seconds is made once a session, by whichever worker needs it first, and is read only: a test that changes a
 file copies the folder to its own ``tmp_path``.
@@ -84,6 +84,21 @@ def den(made_once):
         write_7scenes(root, "den", shots_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
 
     return made_once("den", render)
+
+
+@pytest.fixture(scope="session")
+def map_of_den(made_once, den):
+    """The file of a sparse map of the den's training frames."""
+    from mambaloc.mapping import MapSettings, build_map
+    from mambaloc.mapping.evaluating import read_frames
+    from mambaloc.mapping.recipe import MapRecipe
+    from mambaloc.runtime.maps import MAP_FILE
+
+    def build(folder: Path) -> None:
+        train = read_frames(MapRecipe("den", root=str(den)), "train")
+        build_map(train, MapSettings(width=160), "den").save(folder / MAP_FILE)
+
+    return made_once("map_of_den", build) / "map.safetensors"
 
 
 def write_recipe(path: Path, scenes: Path, model: dict, data: dict, **trainer) -> Path:

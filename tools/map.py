@@ -5,6 +5,10 @@ python tools/map.py MAP --add FRAMES --out FOLDER [--name NAME] [--test RECIPE.y
 python tools/map.py MAP --remove NAME --out FOLDER
 """
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: on small matrices threads only wait for each other
+
 import argparse
 from dataclasses import replace
 from pathlib import Path

@@ -15,12 +15,13 @@ TARGETS = ("android", "ios", "react_native", "web", "pc")
 """Kinds of app that there is a page on integration for."""
 
 _INTEGRATION = files("mambaloc.export") / "integration"
+_MAP_LOCALISER = "map_localiser.hpp"
 
 
 def write_pages(
     folder: Path, contract: Contract, dataset: str, models: Sequence[str], target: str, sparse_map: SparseMap | None
 ) -> None:
-    """Write ``README.md``, ``LICENSE.txt`` and ``INTEGRATION.md``.
+    """Write ``README.md``, ``LICENSE.txt`` and ``INTEGRATION.md``; beside a map, its localiser in C++ for native apps.
 
     Args:
         folder: the bundle.
@@ -37,6 +38,8 @@ def write_pages(
         ("INTEGRATION.md", page),
     ):
         (folder / name).write_text(text, encoding="utf-8")
+    if sparse_map is not None and target != "web":
+        (folder / _MAP_LOCALISER).write_bytes((_INTEGRATION / _MAP_LOCALISER).read_bytes())
 
 
 def _licence(dataset: str) -> str:

@@ -27,10 +27,7 @@ _STEPS = 12
 _CONVERGED = 1e-3  # of the cost
 _DAMPING, _MOST_DAMPING = 1e-4, 1e4
 _AT_ONCE = 512  # points that are eliminated together
-# One standard deviation of the priors.
-_MOVE = 0.05  # of the cameras' spread: 3 cm in a room that is filmed from its middle
-_TURN_RAD = np.radians(1.0)
-_FOCAL, _RADIAL = 0.02, 0.05
+_FOCAL, _RADIAL = 0.02, 0.05  # one standard deviation of the prior
 _FIXED = 1e-9
 _LEAST_DEPTH = 1e-3  # of the cameras' spread
 
@@ -58,25 +55,24 @@ class Bundle:
 def adjust(
     start: Bundle,
     given: Floats,
+    drift: tuple[float, float],
     seen: Observations,
     sigma: float,
     is_lens_free: bool,
     is_fixed: NDArray[np.bool_] | None = None,
-    looseness: float = 1.0,
 ) -> Bundle:
     """Move cameras, points and the lens to where points project to what is seen, with Cauchy's weights.
 
     Args:
         start: the points are the tracks of ``seen``.
-        given: ``world_from_cam`` (N, 4, 4), from which a camera may differ by 5 % of the cameras' spread and 1 degree,
-            one standard deviation.
+        given: ``world_from_cam`` (N, 4, 4).
+        drift: how far a camera is from where it was given, in metres and radians along an axis, one standard deviation.
         seen: rays as the claimed intrinsics have them.
         sigma: an observation that is off by so much, in the plane at depth 1, has half the weight.
         is_lens_free: whether the lens is adjusted.
         is_fixed: points that stay where they are, (T,); none unless given.
-        looseness: times how far a camera may differ.
     """
-    problem = _Problem(given, seen, sigma, is_lens_free, looseness)
+    problem = _Problem(given, drift, seen, sigma, is_lens_free)
     if is_fixed is not None:
         problem.is_fixed = is_fixed[seen.track]
     now, cost, damping = start, problem.cost(start), _DAMPING
@@ -95,14 +91,22 @@ def adjust(
     return now
 
 
+def moves(given: Floats, adjusted: Floats) -> Floats:
+    """Shifts, and turns about the world's axes, from given to adjusted ``world_from_cam`` (N, 4, 4); (N, 6)."""
+    turns = adjusted[:, :3, :3] @ given[:, :3, :3].transpose(0, 2, 1)
+    return np.hstack((adjusted[:, :3, 3] - given[:, :3, 3], [cv2.Rodrigues(turn)[0][:, 0] for turn in turns]))
+
+
 class _Problem:
     """Observations and priors, both in units of their standard deviations."""
 
-    def __init__(self, given: Floats, seen: Observations, sigma: float, is_lens_free: bool, looseness: float) -> None:
+    def __init__(
+        self, given: Floats, drift: tuple[float, float], seen: Observations, sigma: float, is_lens_free: bool
+    ) -> None:
         self.given, self.seen, self.sigma = given, seen, sigma
         self.is_fixed = np.zeros(len(seen), bool)
-        self.unit = spread_m(given)
-        camera = looseness * np.repeat((_MOVE * self.unit, _TURN_RAD), 3)
+        self.least_depth = _LEAST_DEPTH * spread_m(given)
+        camera = np.repeat(drift, 3)
         lens = np.array((_FOCAL, _RADIAL)) * (1 if is_lens_free else _FIXED)
         self.prior = np.concatenate((np.tile(camera, len(given)), lens)) ** -2.0
         self.first = np.searchsorted(seen.track, np.arange(seen.track[-1] + 1))
@@ -113,16 +117,13 @@ class _Problem:
 
     def moves(self, at: Bundle) -> Floats:
         """How far cameras and the lens are from where they were given, (6 N + 2,)."""
-        turns = at.world_from_cam[:, :3, :3] @ self.given[:, :3, :3].transpose(0, 2, 1)
-        turned = [cv2.Rodrigues(turn)[0][:, 0] for turn in turns]
-        cameras = np.hstack((at.world_from_cam[:, :3, 3] - self.given[:, :3, 3], turned))
-        return np.concatenate((cameras.ravel(), at.lens.numbers - Lens().numbers))
+        return np.concatenate((moves(self.given, at.world_from_cam).ravel(), at.lens.numbers - Lens().numbers))
 
     def _project(self, at: Bundle) -> tuple[Floats, Floats, Floats, Floats]:
         """Residuals (O, 2), from cameras to points in the world (O, 3), ideal rays (O, 2), and depths (O, 1)."""
         towards = at.points_m[self.seen.track] - at.world_from_cam[self.seen.frame, :3, 3]
         cam = np.einsum("oji,oj->oi", at.world_from_cam[self.seen.frame, :3, :3], towards)
-        depth = np.maximum(cam[:, 2:], _LEAST_DEPTH * self.unit)
+        depth = np.maximum(cam[:, 2:], self.least_depth)
         ideal = cam[:, :2] / depth
         return (at.lens.distort(ideal) - self.seen.rays) / self.sigma, towards, ideal, depth
 

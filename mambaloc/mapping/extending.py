@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from mambaloc.mapping.adjusting import Bundle, adjust
 from mambaloc.mapping.pairs import pairs_by_pose
-from mambaloc.mapping.structure import mean_descriptors, triangulated
+from mambaloc.mapping.structure import DRIFT, DRIFT_RAD, mean_descriptors, triangulated
 from mambaloc.mapping.tracks import agreeing
 from mambaloc.mapping.triangulation import Observations
 from mambaloc.runtime.maps import CameraPose, MapLocaliser
 from mambaloc.runtime.maps.features import Features
 from mambaloc.runtime.maps.lens import Lens
+from mambaloc.runtime.maps.viewpoints import spread_m
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
@@ -26,7 +27,7 @@ Indices = NDArray[np.int64]
 _NEAR_PX = (12.0, 4.0, 2.0)
 _SIGMA = 0.125  # of that
 _LEAST_AGREEING = 0.3  # of the matches of a pair
-_LOOSE = 100.0  # prior of poses that only the map gives
+_FREE = 3.0  # of the key frames' spread, and radians; how far poses that only the map gives may move
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,8 @@ def extend(
         given: the same from elsewhere, a prior; None where that is not known.
     """
     sparse_map, rng, poses = localiser.map, np.random.default_rng(0), world_from_cam
+    unit_m = spread_m(sparse_map.key_poses)
+    drift = (_FREE * unit_m, _FREE) if given is None else (DRIFT * unit_m, DRIFT_RAD)
     unit_px, focal_px = sparse_map.size[0] / 160, sparse_map.intrinsics[0, 0]
     for near_px in _NEAR_PX:
         known, is_known = _known(localiser, features, poses, near_px * unit_px / focal_px)
@@ -71,10 +74,9 @@ def extend(
             both, tracks = _joined(known, seen, len(sparse_map))
             every_m = np.concatenate((sparse_map.points_m, points_m))[tracks]
             start, is_fixed = Bundle(poses, every_m, Lens()), tracks < len(sparse_map)
-            sigma, prior, looseness = _SIGMA * near_px * unit_px / focal_px, given, 1.0
-            if prior is None:
-                prior, looseness = poses, _LOOSE
-            poses = adjust(start, prior, both, sigma, False, is_fixed, looseness).world_from_cam
+            sigma = _SIGMA * near_px * unit_px / focal_px
+            prior = poses if given is None else given
+            poses = adjust(start, prior, drift, both, sigma, False, is_fixed).world_from_cam
     descriptors, views = mean_descriptors(features, len(points_m), seen, keypoint)
     order = np.argsort(-views.sum(axis=1), kind="stable")
     old = np.zeros((len(sparse_map), len(features)), bool)

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.mapping.adjusting import Bundle, adjust
+from mambaloc.mapping.adjusting import Bundle, adjust, moves
 from mambaloc.mapping.tracks import agreeing, connected
 from mambaloc.mapping.triangulation import Observations, triangulate
 from mambaloc.runtime.maps.features import Features
 from mambaloc.runtime.maps.lens import Lens
+from mambaloc.runtime.maps.viewpoints import spread_m
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
@@ -22,6 +23,9 @@ Indices = NDArray[np.int64]
 # round, with the poses as given, which drift by that much, and with adjusted ones.
 _NEAR_PX = (4.0, 2.0)
 _SIGMA_PX = 0.5
+# How far given poses may drift: at first by 3 cm in a room that is filmed from its middle, then by what was found.
+DRIFT = 0.05  # of the cameras' spread
+DRIFT_RAD = np.radians(1.0)
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,7 @@ def recover_structure(
     focal_px = features[0].intrinsics[0, 0]
     is_one_camera = all(np.allclose(each.intrinsics, features[0].intrinsics) for each in features)
     poses, lens, share = given, Lens(), np.nan
+    drift = (DRIFT * spread_m(given), DRIFT_RAD)
     for near_px in _NEAR_PX:
         is_first = near_px == _NEAR_PX[0]
         points, seen, keypoint, kept = triangulated(features, poses, pairs, matches, near_px * unit_px, rng)
@@ -71,8 +76,10 @@ def recover_structure(
         if not len(points):
             break
         sigma = _SIGMA_PX * unit_px / focal_px
-        bundle = adjust(Bundle(poses, points, Lens()), given, seen, sigma, is_first and is_one_camera)
+        bundle = adjust(Bundle(poses, points, Lens()), given, drift, seen, sigma, is_first and is_one_camera)
         poses = bundle.world_from_cam
+        shift_m, turn_rad = np.sqrt((moves(given, poses).reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
+        drift = (min(drift[0], 2 * shift_m), min(drift[1], 2 * turn_rad))
         if is_first:
             lens = bundle.lens
             features = [lens.straighten(each) for each in features]

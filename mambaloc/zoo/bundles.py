@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from mambaloc.data import PoseDataModule
+from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.export import write_bundle
 from mambaloc.mapping import MapSettings, build_map
 from mambaloc.mapping.evaluating import read_frames
@@ -61,7 +62,7 @@ def map_of(source: str) -> Path | None:
         InputError: where there is no released model of this name, or its map is not the file that was released.
     """
     if is_checkpoint(source):
-        beside = Path(source).parent.parent / "map" / MAP_FILE
+        beside = Path(source).parent.parent / RUN_MAP
         return beside if beside.is_file() else None
     folder = released_folder(source)
     if (path := released_map(folder)) is not None or Manifest.read(folder).scene != _EMBEDDED_SCENE:

@@ -56,13 +56,13 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
         raise InputError(f"--tag {tag}: lower-case letters, digits and underscores make a tag; choose another")
     if folder.exists():
         raise InputError(f"{folder}: is released already; choose another tag")
-    system, data = checkpoint.system(), checkpoint.data()
+    system, data, sparse_map = checkpoint.system(), checkpoint.data(), map_of(str(path))
+    if sparse_map is not None:
+        check_scene(sparse_map, SparseMap.load(sparse_map), data)
     with TemporaryDirectory() as scratch:
         measured = evaluate_checkpoint(checkpoint, Path(scratch), data, accelerator)
     with whole_folder(folder, "choose another --zoo") as partial:
-        sparse_map = map_of(str(path))
         if sparse_map is not None:
-            check_scene(sparse_map, SparseMap.load(sparse_map), data)
             shutil.copyfile(sparse_map, partial / MAP_FILE)
         weights = save({name: tensor.contiguous().cpu() for name, tensor in system.network.state_dict().items()})
         manifest = Manifest(

@@ -1,7 +1,9 @@
 """Bundles: every model in them finds what PyTorch finds, and what was changed is found out."""
 
 import json
+import re
 import shutil
+from dataclasses import replace
 from importlib import resources
 
 import cv2
@@ -15,11 +17,15 @@ from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.export import TARGETS, write_bundle
 from mambaloc.export import bundle as bundle_module
+from mambaloc.export.maps import check_scene
 from mambaloc.export.precision import half_precision
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Localiser, Preprocessing
 from mambaloc.runtime.bundle import verify_bundle
+from mambaloc.runtime.maps import SparseMap, absolute_pose, drift, features, lens, sparse_map, viewpoints
+from mambaloc.runtime.maps import localiser as maps_localiser
+from mambaloc.runtime.maps.localiser import near_px
 
 pytestmark = pytest.mark.usefixtures("converted_once")
 
@@ -34,14 +40,16 @@ def student():
 
 
 @pytest.fixture(scope="module")
-def data(scenes):
-    return PoseDataModule("7scenes", str(scenes), "heads", image_size=(32, 40), short_side=36)
+def data(den):
+    return PoseDataModule("7scenes", str(den), "den", image_size=(32, 40), short_side=36)
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["tensors", "pictures"])
-def bundle(request, student, data, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("bundles") / "new" / "bundle"
-    deviations = write_bundle(student, data, folder, ("onnx", "fp16", "ort"), raw_input=request.param).deviations
+def bundle(request, student, data, map_of_den, tmp_path_factory):
+    """With a map where the models take pictures, without one where they take tensors."""
+    folder, raw = tmp_path_factory.mktemp("bundles") / "new" / "bundle", request.param
+    formats, sparse_map = ("onnx", "fp16", "ort"), map_of_den if raw else None
+    deviations = write_bundle(student, data, folder, formats, raw_input=raw, sparse_map=sparse_map).deviations
     return folder, deviations
 
 
@@ -49,9 +57,10 @@ def bundle(request, student, data, tmp_path_factory):
 def test_every_model_finds_what_pytorch_finds(bundle):
     folder, deviations = bundle
     names = ["model.onnx", "model.fp16.onnx", "model.ort"]
-    assert [each.file for each in deviations] == names
-    assert [each.file for each in verify_bundle(folder)] == names
-    exact, half, ort = (each.position_mm for each in deviations)
+    in_map = ["map.safetensors"] if (folder / "map.safetensors").exists() else []
+    assert [each.file for each in deviations] == names + in_map
+    assert [each.file for each in verify_bundle(folder)] == names + in_map
+    exact, half, ort = (each.position_mm for each in deviations[:3])
     assert exact < 1
     assert ort < 1
     assert half < 20  # 300 m from the origin, where float16 knows quarters of a metre
@@ -70,7 +79,7 @@ def test_a_bundle_tells_an_app_what_it_needs(bundle):
     assert (tensor.name, tensor.type) == (contract["input"]["name"], "tensor(uint8)" if raw else "tensor(float)")
     assert [o.name for o in session.get_outputs()] == list(contract["outputs"])
     assert len(contract["frames"]) == 5
-    assert Localiser(folder).contract.scene == "7scenes/heads"
+    assert Localiser(folder).contract.scene == "7scenes/den"
     assert "Conv" in (folder / "required_operators_and_types.config").read_text()
     assert (folder / "model.fp16.onnx").stat().st_size < 0.6 * (folder / "model.onnx").stat().st_size
     assert "versions: torch 2" in (folder / "README.md").read_text()
@@ -84,9 +93,101 @@ def test_a_bundle_tells_an_app_what_it_needs(bundle):
 def test_a_bundle_tells_where_training_frames_were_taken(bundle, data):
     sequences = json.loads((bundle[0] / "trajectory.json").read_text())["sequences"]
     frames = data.listed_training_frames()
-    assert list(sequences) == ["seq-01", "seq-02"]
+    assert list(sequences) == ["seq-01"]
     found = np.concatenate(list(sequences.values()))
     np.testing.assert_allclose(found, np.hstack([frames.position_m, frames.quaternion]), atol=1e-5)
+
+
+# --- maps -------------------------------------------------------------------------------------------------------------
+
+
+with_map = pytest.mark.parametrize("bundle", [True], indirect=True, ids=["pictures"])
+
+
+@pytest.fixture
+def mapped(bundle, tmp_path):
+    return shutil.copytree(bundle[0], tmp_path / "mapped")
+
+
+@pytest.mark.slow
+@with_map
+def test_a_map_is_described_with_poses_that_a_port_must_find(mapped, map_of_den, data):
+    contract, sparse_map = json.loads((mapped / "contract.json").read_text()), SparseMap.load(map_of_den)
+    assert (mapped / "map.safetensors").read_bytes() == map_of_den.read_bytes()
+    described = contract["map"]
+    assert (described["points"], described["key_frames"]) == (len(sparse_map), len(sparse_map.key_poses))
+    assert (described["scene"], described["size"], described["keypoints"]) == ("den", [160, 120], "sift")
+    assert described["allowed"] == {"position_mm": 10, "rotation_deg": 0.3}
+    frames = data.frames("test")
+    chosen = frames.select(np.array(frames.evenly_spread(5)))
+    for frame, true_m in zip(contract["frames"], chosen.position_m, strict=True):
+        assert frame["intrinsics"] == [[144, 0, 79.5], [0, 144, 59.5], [0, 0, 1]]  # of 160x120, as it was rendered
+        assert frame["map"]["inliers"] >= sparse_map.least_inliers
+        np.testing.assert_allclose(frame["map"]["position_m"], true_m, atol=0.03)
+    assert "`map.safetensors`: sparse map" in (mapped / "README.md").read_text()
+    assert "namespace mambaloc" in (mapped / "map_localiser.hpp").read_text()
+
+
+@pytest.mark.slow
+@with_map
+@pytest.mark.parametrize(("off_m", "is_within"), [(0.009, True), (0.011, False)])
+def test_a_map_that_finds_other_poses_deviates(off_m, is_within, mapped):
+    path = mapped / "contract.json"
+    contract = json.loads(path.read_text())
+    contract["frames"][3]["map"]["position_m"][0] += off_m
+    contract["frames"][1]["map"] = None  # of a frame that was not localised nothing is asked
+    path.write_text(json.dumps(contract))
+    deviation = verify_bundle(mapped)[-1]
+    assert (deviation.file, deviation.within) == ("map.safetensors", is_within)
+    assert deviation.position_mm == pytest.approx(1000 * off_m, abs=0.1)
+
+
+@pytest.mark.slow
+@with_map
+def test_a_bad_description_of_a_map_is_refused(mapped):
+    path = mapped / "contract.json"
+    whole = json.loads(path.read_text())
+
+    def refused(changed, message):
+        path.write_text(json.dumps(changed))
+        with pytest.raises(InputError, match=message) as error:
+            verify_bundle(mapped)
+        assert "\n" not in str(error.value)
+
+    files = {name: entry for name, entry in whole["files"].items() if name != "map.safetensors"}
+    refused({**whole, "files": files}, "describes a map without the digest")
+    refused({**whole, "map": 3}, "is no bundle's contract")
+    refused({**whole, "map": {"allowed": {}}}, "is no bundle's contract")
+    frames = [{**frame, "map": 3} for frame in whole["frames"]]
+    refused({**whole, "frames": frames}, "is no bundle's contract")
+    frames = [{**frame, "intrinsics": [1]} for frame in whole["frames"]]
+    refused({**whole, "frames": frames}, "cannot be the camera")
+    (mapped / "map.safetensors").write_bytes(b"noise")
+    refused(whole, "sha256 differs")
+
+
+def test_a_map_of_another_scene_is_refused(student, map_of_den, scenes, tmp_path):
+    other = PoseDataModule("7scenes", str(scenes), "heads", image_size=(32, 40), short_side=36)
+    with pytest.raises(InputError, match=r"is a map of 'den', which localises 0 of 8 .* of heads\. .*--no-map"):
+        write_bundle(student, other, tmp_path / "bundle", sparse_map=map_of_den)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.6])
+def test_a_map_in_another_frame_is_refused(turn_rad, map_of_den, data):
+    """Its matches are as good; only where they say that the camera is differs."""
+    sparse_map, moved = SparseMap.load(map_of_den), np.eye(4)
+    moved[:3, :3], moved[0, 3] = cv2.Rodrigues(np.array([0, 0, turn_rad]))[0], 0.0 if turn_rad else 0.4
+    points_m = (sparse_map.points_m @ moved[:3, :3].T + moved[:3, 3]).astype(np.float32)
+    check_scene(map_of_den, sparse_map, data)
+    with pytest.raises(InputError, match="localises 0 of 8"):
+        check_scene(map_of_den, replace(sparse_map, points_m=points_m, key_poses=moved @ sparse_map.key_poses), data)
+
+
+def test_a_damaged_map_is_refused(student, data, map_of_den, tmp_path):
+    (tmp_path / "map.safetensors").write_bytes(map_of_den.read_bytes()[:-9])
+    with pytest.raises(InputError, match=r"map\.safetensors: is damaged"):
+        write_bundle(student, data, tmp_path / "bundle", sparse_map=tmp_path / "map.safetensors")
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -94,6 +195,31 @@ def test_every_kind_of_app_has_a_page(target):
     page = (resources.files("mambaloc.export") / "integration" / f"{target}.md").read_text()
     assert "contract.json" in page
     assert "frames" in page
+    assert "map.safetensors" in page
+
+
+def test_native_apps_decide_as_python_does():
+    """The C++ of the bundles was run beside Python once; this holds its numbers to Python's from then on."""
+    header = (resources.files("mambaloc.export") / "integration" / "map_localiser.hpp").read_text()
+    written = {float(number) for number in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?", header)}
+    numbers = {
+        *(
+            maps_localiser._AT_ONCE,
+            maps_localiser._RATIO,
+            maps_localiser._GUIDED_RATIO,
+            maps_localiser._GUIDED_FARTHEST,
+        ),
+        *(
+            maps_localiser._NEAREST,
+            *maps_localiser._WINDOWS,
+            maps_localiser._LEAST_SHARE,
+            maps_localiser._MOST_DEVIATION,
+        ),
+        *(near_px(160), drift._LENGTH, drift._NUGGET, viewpoints._TURN_DEG, lens._STEPS),
+        *(absolute_pose._TRIALS, absolute_pose._CONFIDENCE, absolute_pose._STEPS),
+        *(features._MOST_KEYPOINTS, features._CONTRAST, sparse_map.VERSION),
+    }
+    assert numbers - written == set()
 
 
 # --- preprocessing inside ---------------------------------------------------------------------------------------------

@@ -68,12 +68,13 @@ def test_the_contract_travels_with_the_model(student, model):
     assert Contract.from_json(contract.to_json(), "here") == contract
 
 
-def test_the_runtime_needs_no_torch(model, tmp_path):
+def test_the_runtime_needs_no_torch(model, map_of_den, tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), picture())
     program = (
         "import sys\nfor name in ('torch', 'rich', 'filelock', 'yaml', 'onnx'): sys.modules[name] = None\n"
         "import mambaloc\nfrom mambaloc.runtime import Localiser\n"
-        f"print(Localiser({str(model)!r}).localise({str(tmp_path / 'a.png')!r}).position_m.tolist())\n"
+        f"localiser = Localiser({str(model)!r}, sparse_map={str(map_of_den)!r})\n"
+        f"print(localiser.localise({str(tmp_path / 'a.png')!r}).position_m.tolist())\n"
         "heavy = {'lightning', 'timm', 'torchvision'} & set(sys.modules)\nassert not heavy, heavy"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

@@ -30,7 +30,7 @@ def test_cameras_that_look_at_the_wall_are_sure_and_others_lost(wall):
     assert np.allclose(found.axes[2], (0, 0, 1))
     assert {name.removeprefix("-") for name in found.names[:2]} == {"x", "y"}
     level = np.cos(found.headings)[:, None] * found.axes[0] + np.sin(found.headings)[:, None] * found.axes[1]
-    near = np.linalg.norm(found.places, axis=1) < 0.8
+    near = np.linalg.norm(found.places[:, None] - wall.key_poses[:, :3, 3] @ found.axes[:2].T, axis=2).min(axis=1) < 0.3
     assert (found.certainty[near][:, level[:, 0] > 0.99] > 0.5).all()
     assert (found.certainty[near][:, level[:, 0] < -0.5] == 0).all()
 
@@ -44,10 +44,11 @@ def test_a_gap_lies_beside_what_is_known():
     found = Survey(np.eye(3), ["x", "y", "z"], places, 1.0, HEADINGS, 100 * certainty, certainty)
     first = gaps(found, places)[0]
     assert first.matches == 0
-    assert np.degrees(np.arctan2(first.direction[1], first.direction[0])) == pytest.approx(60, abs=31)
+    angle = np.degrees(np.arctan2(first.direction[1], first.direction[0]))
+    assert -31 < angle < 61  # 30 degrees from one of those that are known, at most
     lines = describe_gaps(found, gaps(found, places)).splitlines()
     assert 1 <= len(lines) <= 3
-    assert lines[0].startswith(f"film next 1: from x {first.place[0]:.1f}, y 0.0, looking towards +")
+    assert lines[0].startswith(f"film next 1: from x {first.place[0]:.1f}, y 0.0, looking towards +x")
 
 
 def test_a_place_that_is_known_all_around_has_no_gap():

@@ -1,5 +1,6 @@
 """Publishing, and loading from everywhere, on a tiny training."""
 
+import hashlib
 import pickle
 import shutil
 from dataclasses import replace
@@ -11,17 +12,23 @@ import yaml
 import mambaloc
 from mambaloc.cli import main
 from mambaloc.errors import InputError
+from mambaloc.mapping import MapSettings, build_map
+from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.models.mambaloc import LitMambaLoc
 from mambaloc.zoo import Manifest, list_released, load
+from mambaloc.zoo.bundles import map_of
 from mambaloc.zoo.publishing import card, publish
 
 
 @pytest.fixture(scope="module")
-def run(trained, tmp_path_factory):
-    """The tiny system on images that are not square."""
+def run(trained, scenes, tmp_path_factory):
+    """The tiny system on images that are not square, with a map beside it."""
     folder = tmp_path_factory.mktemp("run")
     words = ["--data.image_size", "[32, 36]", "--trainer.default_root_dir", str(folder)]
     main([str(trained.parent / "recipe.yaml"), *words])
+    frames = read_frames(MapRecipe("heads", root=str(scenes)), "train")
+    build_map(frames, MapSettings(width=96, least_inliers=8), "heads").save(folder / "map/map.safetensors")
     return folder
 
 
@@ -63,6 +70,26 @@ def test_every_figure_says_where_it_is_from(released):
     card = (released / "README.md").read_text()
     assert f"{result.position_error_m:.3f} m" in card
     assert "no official split" in card
+
+
+def test_the_runs_map_is_released_with_it(run, released):
+    manifest, path = Manifest.read(released), released / "map.safetensors"
+    assert path.read_bytes() == (run / "map/map.safetensors").read_bytes()
+    assert manifest.map_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert manifest.map_bytes == path.stat().st_size
+    assert map_of(f"local-dir:{released}") == path
+    assert map_of(str(run / "checkpoints/best.ckpt")) == run / "map/map.safetensors"
+    assert "sparse map, 0." in (released / "README.md").read_text()
+
+
+def test_a_model_may_be_released_without_a_map(copy, trained):
+    assert map_of(str(trained / "checkpoints/best.ckpt")) is None
+    manifest = replace(Manifest.read(copy), map_sha256=None, map_bytes=None)
+    (copy / "manifest.yaml").write_text(manifest.to_yaml())
+    assert "map_" not in manifest.to_yaml()
+    assert Manifest.read(copy) == manifest
+    assert map_of(f"local-dir:{copy}") is None
+    assert "sparse map" not in card("mambaloc.tiny", manifest)
 
 
 def test_a_card_says_what_the_system_is(released):
@@ -120,9 +147,25 @@ def test_changed_weights_are_refused(copy):
     refused(copy, "cannot be read")
 
 
-def test_a_pickle_in_place_of_weights_is_not_opened(copy):
-    import hashlib
+def test_a_changed_map_is_refused_and_the_model_loads(copy):
+    (copy / "map.safetensors").write_bytes((copy / "map.safetensors").read_bytes()[:-1])
+    with pytest.raises(InputError, match=r"map\.safetensors: .*sha256 differs"):
+        map_of(f"local-dir:{copy}")
+    assert type(load(f"local-dir:{copy}")) is LitMambaLoc
+    (copy / "map.safetensors").unlink()
+    with pytest.raises(InputError, match=r"map\.safetensors: cannot be read"):
+        map_of(f"local-dir:{copy}")
 
+
+def test_a_damaged_map_is_not_released(run, tmp_path):
+    damaged = shutil.copytree(run, tmp_path / "run")
+    (damaged / "map/map.safetensors").write_bytes(b"noise")
+    with pytest.raises(InputError, match=r"map\.safetensors: is damaged"):
+        publish(damaged / "checkpoints/best.ckpt", "tiny", tmp_path / "zoo", "cpu")
+    assert not list((tmp_path / "zoo").glob("*"))
+
+
+def test_a_pickle_in_place_of_weights_is_not_opened(copy):
     class Trap:
         def __reduce__(self):
             return pytest.fail, ("the pickle was opened",)

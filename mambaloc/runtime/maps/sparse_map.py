@@ -103,7 +103,7 @@ class SparseMap:
             "crc32": _crc32(arrays),
         }
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        with writing(path, "choose another file with --out"):
+        with writing(path, "free some space, or choose another folder"):
             path.parent.mkdir(parents=True, exist_ok=True)
             with whole_file(path) as partial:
                 partial.write_bytes(save(whole, {"about": json.dumps(about)}))
