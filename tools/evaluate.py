@@ -1,5 +1,9 @@
 """Measure a checkpoint: python tools/evaluate.py CHECKPOINT [--out FOLDER] [--data.KEY VALUE ...]."""
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: on a map's small matrices threads only wait
+
 from pathlib import Path
 
 from mambaloc.cli import OneLineErrorParser

@@ -17,7 +17,7 @@ def main() -> None:
     parser.add_argument("--zoo", type=Path, default=Path("zoo"), help="folder of released models")
     args = parser.parse_args()
     folder = publish(args.checkpoint, args.tag, args.zoo)
-    print(f"{folder}: manifest.yaml, weights.safetensors, README.md")
+    print(f"{folder}: {', '.join(sorted(file.name for file in folder.iterdir()))}")
 
 
 if __name__ == "__main__":

@@ -31,14 +31,15 @@ def write_pages(
         target: of ``TARGETS``.
         sparse_map: beside them, where there is one.
     """
+    is_native = target != "web"
     page = (_INTEGRATION / f"{target}.md").read_text(encoding="utf-8")
     for name, text in (
-        ("README.md", _card(contract, models, sparse_map)),
+        ("README.md", _card(contract, models, sparse_map, is_native)),
         ("LICENSE.txt", _licence(dataset)),
         ("INTEGRATION.md", page),
     ):
         (folder / name).write_text(text, encoding="utf-8")
-    if sparse_map is not None and target != "web":
+    if sparse_map is not None and is_native:
         (folder / _MAP_LOCALISER).write_bytes((_INTEGRATION / _MAP_LOCALISER).read_bytes())
 
 
@@ -50,11 +51,12 @@ map.safetensors, which hold some of those frames, their poses and their keypoint
 """
 
 
-def _card(contract: Contract, models: Sequence[str], sparse_map: SparseMap | None) -> str:
+def _card(contract: Contract, models: Sequence[str], sparse_map: SparseMap | None, is_native: bool) -> str:
     files = [f"- `{name}`" for name in models]
     if sparse_map is not None:
         points, frames = len(sparse_map), len(sparse_map.key_poses)
         files.append(f"- `{MAP_FILE}`: sparse map, {points} points of {frames} key frames, for poses to centimetres")
+        files += [f"- `{_MAP_LOCALISER}`: localises in it, in C++"] if is_native else []
     listed = "\n".join(files)
     trained = "\n".join(
         f"- {name}: {_in_words(value)}" for name, value in contract.trained.items() if value is not None

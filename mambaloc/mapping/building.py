@@ -69,7 +69,7 @@ class MapSettings:
     key_frames: int = 160
     width: int = 320
     most_bytes: int = 4 * 2**20
-    least_inliers: int = 12
+    least_inliers: int = 20
     seed: int = 0
 
 

@@ -27,7 +27,7 @@ SWITCHES = [
 @pytest.fixture(scope="session")
 def bundle(made_once, scenes):
     """A model that takes normalised tensors, and does not say how sure it is."""
-    return made_once("demo_bundle", lambda folder: _export(folder / "bundle", scenes, ("onnx",))) / "bundle"
+    return made_once("demo_bundle", lambda folder: _export(folder / "bundle", scenes, "heads")) / "bundle"
 
 
 @pytest.fixture(scope="session")
@@ -35,12 +35,22 @@ def raw_bundle(made_once, scenes):
     """Models that resize, crop and scale by themselves, and say how sure they are."""
 
     def make(folder):
-        _export(folder / "bundle", scenes, ("onnx", "fp16"), raw_input=True, knows_its_frames=True)
+        _export(folder / "bundle", scenes, "heads", ("onnx", "fp16"), raw_input=True, knows_its_frames=True)
 
     return made_once("demo_raw_bundle", make) / "bundle"
 
 
-def _export(out, scenes, formats, raw_input=False, knows_its_frames=False):
+@pytest.fixture(scope="session")
+def map_bundle(made_once, den, map_of_den):
+    """A model and a map of the embedded room."""
+
+    def make(folder):
+        _export(folder / "bundle", den, "den", sparse_map=map_of_den, knows_its_frames=True)
+
+    return made_once("demo_map_bundle", make) / "bundle"
+
+
+def _export(out, root, scene, formats=("onnx",), raw_input=False, knows_its_frames=False, sparse_map=None):
     """Export a student that was never trained: its poses differ by centimetres from frame to frame of a film."""
     import torch  # what is made already needs none of it
 
@@ -49,7 +59,8 @@ def _export(out, scenes, formats, raw_input=False, knows_its_frames=False):
     from mambaloc.models.student import LitStudent
 
     size = (32, 40)
-    data = PoseDataModule("7scenes", scenes, "heads", image_size=size, short_side=36, validation="sequences")
+    validation = "sequences" if scene == "heads" else "none"
+    data = PoseDataModule("7scenes", str(root), scene, image_size=size, short_side=36, validation=validation)
     data.setup("fit")
     torch.manual_seed(0)
     system = LitStudent(backbone="test_efficientnet", width=16, image_size=size)
@@ -59,7 +70,7 @@ def _export(out, scenes, formats, raw_input=False, knows_its_frames=False):
         head.position[0].weight *= 30
         head.rotation[0].bias.zero_()
     system.provenance = {"data": data.describe()} if knows_its_frames else {}
-    write_bundle(system.eval(), data, out, formats, "web", raw_input=raw_input)
+    write_bundle(system.eval(), data, out, formats, "web", raw_input=raw_input, sparse_map=sparse_map)
 
 
 @pytest.fixture(scope="session")
@@ -90,6 +101,11 @@ def site(made_once, bundle, film, modules):
 @pytest.fixture(scope="session")
 def raw_site(made_once, raw_bundle, modules):
     return made_once("demo_raw_site", lambda folder: build_site(raw_bundle, folder / "site")) / "site"
+
+
+@pytest.fixture(scope="session")
+def map_site(made_once, map_bundle, film, modules):
+    return made_once("demo_map_site", lambda folder: build_site(map_bundle, folder / "site", film)) / "site"
 
 
 @pytest.fixture(scope="session")

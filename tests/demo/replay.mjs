@@ -1,14 +1,14 @@
-// node replay.mjs MODULES LOCALISER BUNDLE MODEL: the poses of the bundle's frames by the page's own module, as JSON.
+// node replay.mjs MODULES WEB BUNDLE MODEL: the poses of the bundle's frames by the page's own module, as JSON.
 import { readFile } from "node:fs/promises";
 import { createRequire } from "node:module";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";
 
-const [modules, localiserFile, bundle, model] = process.argv.slice(2);
+const [modules, web, bundle, model] = process.argv.slice(2);
 const require = createRequire(join(modules, "replay.cjs"));
 const ort = require("onnxruntime-node");
 const { PNG } = require("pngjs");
-const { Localiser } = await import(pathToFileURL(localiserFile));
+const { Localiser } = await import(pathToFileURL(join(web, "localiser.js")));
 
 const contract = JSON.parse(await readFile(join(bundle, "contract.json"), "utf8"));
 const localiser = await Localiser.create(ort, await readFile(join(bundle, model)), contract);

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 from importlib import resources
@@ -16,13 +15,7 @@ from mambaloc.runtime.rotations import rotation_error_deg
 
 pytestmark = pytest.mark.slow
 HERE = Path(__file__).parent
-LOCALISER = resources.files("mambaloc.demo") / "web/localiser.js"
-
-
-@pytest.fixture(scope="module")
-def localiser_file(tmp_path_factory):
-    """As a site has it: where no package.json says otherwise, Node wants modules to be called .mjs."""
-    return shutil.copyfile(LOCALISER, tmp_path_factory.mktemp("page") / "localiser.mjs")
+WEB = resources.files("mambaloc.demo") / "web"
 
 
 def node(*words, **options):
@@ -35,9 +28,9 @@ def node(*words, **options):
     ("which", "model"),
     [("bundle", "model.onnx"), ("raw_bundle", "model.onnx"), ("raw_bundle", "model.fp16.onnx")],
 )
-def test_poses_in_node_are_pythons(which, model, modules, localiser_file, request):
+def test_poses_in_node_are_pythons(which, model, modules, request):
     folder = request.getfixturevalue(which)
-    found = json.loads(node(HERE / "replay.mjs", modules, localiser_file, folder, model))
+    found = json.loads(node(HERE / "replay.mjs", modules, WEB, folder, model))
     localiser = Localiser(folder / model)
     frames = json.loads((folder / "contract.json").read_text())["frames"]
     assert len(found) == len(frames) == 5
@@ -60,14 +53,14 @@ CASES = [  # (height, width) of the picture, short side, crop
 ]
 
 
-def test_pictures_look_to_the_page_as_to_opencv(modules, localiser_file, tmp_path):
+def test_pictures_look_to_the_page_as_to_opencv(tmp_path):
     told = []
     for number, ((height, width), short_side, crop) in enumerate(CASES):
         rgb = np.random.default_rng(number).integers(0, 256, (height, width, 3), dtype=np.uint8)
         (tmp_path / f"{number}.rgb").write_bytes(rgb.tobytes())
         told.append({"width": width, "height": height, "preprocessing": {"short_side": short_side, "crop": crop}})
     (tmp_path / "cases.json").write_text(json.dumps(told))
-    node(HERE / "preprocess.mjs", localiser_file, tmp_path)
+    node(HERE / "preprocess.mjs", WEB, tmp_path)
     for number, ((height, width), short_side, crop) in enumerate(CASES):
         rgb = np.frombuffer((tmp_path / f"{number}.rgb").read_bytes(), np.uint8).reshape(height, width, 3)
         expected = Preprocessing(short_side, crop).apply(rgb).transpose(2, 0, 1)

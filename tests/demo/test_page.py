@@ -3,11 +3,13 @@
 import json
 import shutil
 import time
+import warnings
 
 import cv2
 import numpy as np
 import pytest
 
+from mambaloc.errors import InputWarning
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.rotations import rotation_error_deg
 
@@ -23,6 +25,12 @@ def address(site, served):
 @pytest.fixture(scope="module")
 def raw_address(raw_site, served):
     with served(raw_site) as server:
+        yield f"http://127.0.0.1:{server.server_port}/"
+
+
+@pytest.fixture(scope="module")
+def map_address(map_site, served):
+    with served(map_site) as server:
         yield f"http://127.0.0.1:{server.server_port}/"
 
 
@@ -127,6 +135,71 @@ def test_the_page_checks_the_bundle_by_itself(opened):
     page.wait_for_selector("#verdict:has-text('Yes')", timeout=30_000)
 
 
+DRAWN = """() => {
+    const canvas = document.querySelector("#matches");
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    return data.filter((value, i) => i % 4 === 3 && value).length;
+}"""
+
+
+def test_the_map_answers_as_in_python(opened, map_bundle, map_address):
+    """Python's test vectors, the runtime without torch, and the page find one pose."""
+    page, localiser = opened("frames", map_address), Localiser(map_bundle)
+    frames = json.loads((map_bundle / "contract.json").read_text())["frames"]
+    for count, frame in enumerate(frames, start=1):
+        page.click(f'[data-frame-file="{frame["file"]}"]')
+        found = pose_of(page, count)
+        expected = localiser.localise(map_bundle / frame["file"], frame["intrinsics"])
+        assert expected.source == page.get_attribute("#pose", "data-answer") == page.inner_text("[data-show=answer]")
+        assert expected.source == "map"
+        check(found, expected, mm=10.0, deg=0.3)
+        vector = frame["map"]
+        assert 1000 * np.linalg.norm(found[0] - vector["position_m"]) < 10
+        assert rotation_error_deg(found[1], np.array(vector["quaternion_wxyz"])) < 0.3
+        inliers = int(page.get_attribute("#pose", "data-inliers"))
+        assert abs(inliers - vector["inliers"]) <= 3
+        assert page.inner_text("[data-show=answer-detail]").startswith(f"{inliers} of ")
+        assert page.evaluate(DRAWN) > 10 * inliers  # a dot each
+        radius_m = float(page.text_content("[data-show=radius-position]").strip("±m "))
+        assert radius_m == pytest.approx(expected.position_radius_m, abs=0.002)
+    page.click("#check")
+    page.wait_for_selector("#verdict:has-text('Yes')", timeout=60_000)
+    assert "map" in page.inner_text("#verdict")
+
+
+def test_the_network_answers_where_the_map_does_not(opened, map_bundle, map_address, tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.png"), noise)
+    cv2.imwrite(str(tmp_path / "wide.png"), cv2.imread(str(map_bundle / "frames/1.png"))[:90])  # by an unknown camera
+    page, localiser = opened("photo", map_address), Localiser(map_bundle)
+    for count, name in enumerate(("noise.png", "wide.png"), start=1):
+        page.set_input_files("#photo", tmp_path / name)
+        with warnings.catch_warnings(action="ignore", category=InputWarning):
+            expected = localiser.localise(tmp_path / name)
+        check(pose_of(page, count), expected)
+        assert expected.source == page.get_attribute("#pose", "data-answer") == "network"
+        assert page.evaluate(DRAWN) == 0
+
+
+def test_the_film_of_the_maps_room_is_localised_to_centimetres(opened, map_address):
+    page = opened("film", map_address)
+    page.wait_for_selector("#pose[data-film-frame]", timeout=30_000)
+    for _ in range(5):
+        page.wait_for_timeout(300)
+        error_m = float(page.inner_text("[data-show=error-position]").removesuffix(" m"))
+        assert page.get_attribute("#pose", "data-answer") == "map"
+        assert error_m < 0.05
+
+
+def test_a_bundle_without_a_map_says_nothing_of_one(opened):
+    page = opened("frames")
+    page.click('[data-frame-file="frames/1.png"]')
+    pose_of(page)
+    assert not page.is_visible("#answer")
+    assert not page.is_visible(".key .points")
+    assert page.evaluate(DRAWN) == 0
+
+
 @pytest.mark.parametrize("kind", ["colour", "grey", "turned"])
 def test_photos_are_localised(opened, bundle, tmp_path, kind):
     page = opened("photo")
@@ -218,6 +291,21 @@ def test_a_browser_whose_threads_fail_gets_one(browser, address):
     assert "1 thread" in page.inner_text("#wasm-name")
     assert "out of memory" in page.inner_text("#note")
     page.close()
+
+
+def test_without_the_map_the_network_answers(browser, map_site, tmp_path, served):
+    changed = shutil.copytree(map_site, tmp_path / "site")
+    with (changed / "bundle/map.safetensors").open("r+b") as file:
+        file.truncate(1000)
+    with served(changed) as server:
+        page = browser.new_page()
+        page.goto(f"http://127.0.0.1:{server.server_port}/?source=frames&backend=wasm")
+        page.wait_for_selector("body[data-state=ready]", timeout=60_000)
+        assert "The network answers without the map." in page.inner_text("#note")
+        page.click('[data-frame-file="frames/1.png"]')
+        page.wait_for_selector('#pose[data-frame="1"]', timeout=30_000)
+        assert page.get_attribute("#pose", "data-answer") == "network"
+        page.close()
 
 
 def test_a_changed_model_is_refused(browser, site, tmp_path, served):

@@ -14,6 +14,7 @@ from mambaloc.mapping import MapSettings, PosedFrames, build_map
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.runtime.maps import MapLocaliser, SparseMap
+from mambaloc.runtime.maps.absolute_pose import CameraPose
 
 SETTINGS = MapSettings(key_frames=40, width=160)
 
@@ -209,3 +210,19 @@ def test_maps_are_built_and_used_without_torch():
 def test_pictures_are_not_enlarged(walk):
     with pytest.raises(InputError, match=r"width 320: the pictures are 160 pixels wide\. Give at most that\."):
         build_map(walk.frames, MapSettings(key_frames=40, width=320), "room")
+
+
+@pytest.mark.parametrize(("off_m", "off_deg"), [(0.0, 0), (0.3, 8), (5.0, 170)])
+def test_a_prior_never_makes_an_answer_worse(room, other_walk, off_m, off_deg):
+    """Whether it is right, off, or wild; pictures of which a third is left."""
+    localiser, frames = MapLocaliser(room), other_walk.frames
+    for row in range(0, 16, 3):
+        image, truth = frames.images[row].copy(), frames.world_from_cam[row]
+        image[:, 55:] = 128
+        turn = Rotation.from_rotvec(np.radians(off_deg) * np.array([0, 0.8, 0.6])).as_matrix()
+        prior = CameraPose(turn @ truth[:3, :3], truth[:3, 3] + off_m * np.array([0.6, 0.8, 0]))
+        alone = localiser.localise(image, frames.intrinsics[row])
+        both = localiser.localise(image, frames.intrinsics[row], prior)
+        assert (both.is_accepted, both.inliers) >= (alone.is_accepted, alone.inliers)
+        if both.is_accepted:
+            assert _errors(both, truth)[0] < 0.1

@@ -48,7 +48,8 @@ def test_a_run_is_exported_verified_and_localises(trained_student, scenes, tmp_p
 def test_a_released_model_is_exported_by_name(tmp_path, capsys):
     tool("export", "student.embedded_room", "--to", "int8", "--out", tmp_path / "bundle")
     assert "int8 (all layers): median" in capsys.readouterr().out
-    assert {path.name for path in (tmp_path / "bundle").glob("m*")} == {"model.int8.onnx", "map.safetensors"}
+    written = {path.name for path in (tmp_path / "bundle").glob("m*")}
+    assert written == {"model.int8.onnx", "map.safetensors", "map_localiser.hpp"}
 
 
 def test_a_picture_alone_is_localised_in_the_embedded_room(tmp_path, capsys):

@@ -19,6 +19,7 @@ export function describe(list, contract, verified) {
     Trained: [trained.device, trained.seed === undefined ? "" : `seed ${trained.seed}`].filter(Boolean).join(", "),
     Commit: trained.commit?.slice(0, 12),
     Weights: short(contract.weights_sha256),
+    Map: inWords(contract.map, contract.files["map.safetensors"]),
     File: `${(file.bytes / 1e6).toFixed(1)} MB, ${short(file.sha256)}, ${checked}`,
     Attitude: "heading and horizon are from an “up” that is estimated: the mean over the training cameras",
   };
@@ -31,6 +32,15 @@ export function describe(list, contract, verified) {
 
 function element(tag, text) {
   return Object.assign(document.createElement(tag), { textContent: text });
+}
+
+function inWords(map, file) {
+  if (!map) return "";
+  const focal = (map.intrinsics[0][0] / map.size[0]).toFixed(2);
+  return (
+    `${map.points} points of ${map.key_frames} key frames, ${(file.bytes / 1e6).toFixed(1)} MB. Pictures are taken ` +
+    `to be of its camera, without distortion, focal length ${focal} of the width`
+  );
 }
 
 function short(digest) {

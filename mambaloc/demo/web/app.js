@@ -2,9 +2,9 @@
 
 import { describe } from "./about.js";
 import { Engine } from "./engine.js";
-import { TestFrames } from "./frames.js";
+import { TestFrames, deviations } from "./frames.js";
 import { poseOf } from "./geometry.js";
-import { deviation, modelOf } from "./localiser.js";
+import { drawMatches } from "./matches.js";
 import { Readout } from "./readout.js";
 import { Film, Stream, decoded, openCamera, optionalJson } from "./sources.js";
 import { View } from "./view.js";
@@ -122,9 +122,11 @@ async function startEngine(backend) {
     if (input.value === "webgpu") input.disabled = !info.webgpu;
   }
   $("sideways").hidden = contract.preprocessing.crop[1] <= contract.preprocessing.short_side;
-  note(info.note);
+  note(info.notes.join(" "));
+  view?.showMap(info.mapPoints);
+  document.querySelector(".key .points").hidden = !info.mapPoints;
   describe($("about"), contract, info.verified);
-  frames = new TestFrames($("frames"), $("verdict"), contract, allowed(), takeFrame);
+  frames = new TestFrames($("frames"), $("verdict"), contract, takeFrame);
   setState("ready", "Ready");
 }
 
@@ -166,6 +168,7 @@ function leave() {
   video.removeAttribute("src");
   video.load();
   for (const id of ["video", "still", "crop", "error"]) $(id).hidden = true;
+  drawMatches($("matches"), []);
   view?.clear();
   readout.restart();
 }
@@ -213,8 +216,12 @@ function startStream(frameAt = null) {
   });
 }
 
-/** Localise one picture and show where it was taken; null if another source was chosen meanwhile. */
-async function localise(bitmap, truth = null) {
+/**
+ * Localise one picture and show where it was taken; null if another source was chosen meanwhile.
+ * @param truth pose, where that is known.
+ * @param {number[][]|null} intrinsics of the picture; the map's camera unless given.
+ */
+async function localise(bitmap, truth = null, intrinsics = null) {
   const turn = visit;
   const { width, height } = bitmap;
   try {
@@ -224,9 +231,10 @@ async function localise(bitmap, truth = null) {
     bitmap.close();
     throw error;
   }
-  const pose = await engine.localise(bitmap);
+  const pose = await engine.localise(bitmap, intrinsics);
   if (turn === visit) {
     $("error").hidden = true;
+    drawMatches($("matches"), pose.source === "map" ? pose.map.matches : []);
     view?.show(pose, truth);
   }
   return pose;
@@ -245,9 +253,9 @@ async function localiseStill(blob, name, frame = null) {
     const [width, height] = [bitmap.width, bitmap.height].map((side) => Math.max(1, Math.round(side * shrunk)));
     const canvas = Object.assign($("still"), { width, height, hidden: false });
     canvas.getContext("2d").drawImage(bitmap, 0, 0, width, height);
-    const pose = await localise(bitmap);
+    const pose = await localise(bitmap, null, frame?.intrinsics);
     if (turn !== visit) return null;
-    if (frame) readout.showDeviation(deviation(pose, frame), allowed());
+    if (frame) readout.showDeviation(deviations(pose, frame, contract).at(-1));
     else readout.forgetErrors();
     readout.show(pose, source, frame?.file);
     setState("ready", "Localised");
@@ -302,6 +310,7 @@ function setState(state, text) {
 function fail(error) {
   if ($("error").hidden || $("error").textContent !== error.message) $("error").textContent = error.message;
   $("error").hidden = false;
+  drawMatches($("matches"), []);
   view?.clear();
   setState("error", "No pose");
 }
@@ -309,11 +318,6 @@ function fail(error) {
 function note(text) {
   $("note").textContent = text;
   $("note").hidden = !text;
-}
-
-/** How far the model may be from PyTorch. */
-function allowed() {
-  return contract.files[modelOf(contract)].allowed;
 }
 
 function threads(count) {

@@ -21,7 +21,7 @@ export class Engine {
     } catch (error) {
       const simplest = { backend: "wasm", threads: 1 };
       const engine = await Engine.#attempt(simplest, onProgress).catch(() => Promise.reject(error));
-      engine.info.note = `One thread of WebAssembly runs the model: ${error.message}`;
+      engine.info.notes.push(`One thread of WebAssembly runs the model: ${error.message}`);
       return engine;
     }
   }
@@ -37,12 +37,15 @@ export class Engine {
     return engine;
   }
 
-  /** Localise a bitmap, which the worker takes. */
-  localise(bitmap) {
+  /**
+   * Localise a bitmap, which the worker takes.
+   * @param {number[][]|null} intrinsics of it; the map's camera unless given.
+   */
+  localise(bitmap, intrinsics = null) {
     const id = (this.#count += 1);
     return new Promise((resolve, reject) => {
       this.#waiting.set(id, { resolve, reject });
-      this.#worker.postMessage({ type: "localise", id, bitmap }, [bitmap]);
+      this.#worker.postMessage({ type: "localise", id, bitmap, intrinsics }, [bitmap]);
     });
   }
 

@@ -1,48 +1,63 @@
-/** The bundle's test frames: does this browser find the poses that PyTorch found? */
+/** The bundle's test frames: does this browser find the poses that Python found? */
 
-import { deviation } from "./localiser.js";
+import { deviation, modelOf } from "./localiser.js";
 import { small } from "./readout.js";
+
+/**
+ * How far the network's pose of a test frame is from the one in the contract, and after it, where the map has one, the
+ * map's.
+ * @returns {{name: string, mm: number, deg: number, allowed: object, within: boolean}[]}
+ */
+export function deviations(pose, frame, contract) {
+  const pairs = [["network", pose.network, frame, contract.files[modelOf(contract)].allowed]];
+  if (pose.map !== undefined && frame.map) pairs.push(["map", pose.map, frame.map, contract.map.allowed]);
+  return pairs.map(([name, found, expected, allowed]) => {
+    const { mm, deg } = found ? deviation(found, expected) : { mm: Infinity, deg: Infinity };
+    return { name, mm, deg, allowed, within: mm <= allowed.position_mm && deg <= allowed.rotation_deg };
+  });
+}
 
 export class TestFrames {
   #list;
   #verdict;
-  #frames;
-  #allowed;
+  #contract;
   #localise;
 
   /**
    * @param {HTMLElement} list to fill with a button for each frame.
    * @param {HTMLElement} verdict on all of them.
    * @param {object} contract of the bundle.
-   * @param {object} allowed deviation: `position_mm` and `rotation_deg`.
    * @param {(frame: object) => Promise<object|null>} localise one of the contract's frames; null if that failed.
    */
-  constructor(list, verdict, contract, allowed, localise) {
+  constructor(list, verdict, contract, localise) {
     this.#list = list;
     this.#verdict = verdict;
-    this.#frames = contract.frames;
-    this.#allowed = allowed;
+    this.#contract = contract;
     this.#localise = localise;
-    list.replaceChildren(...this.#frames.map((frame, i) => this.#button(frame, i)));
-    verdict.textContent = "Does this browser find what PyTorch found?";
+    list.replaceChildren(...contract.frames.map((frame, i) => this.#button(frame, i)));
+    verdict.textContent = "Does this browser find what Python found?";
     delete verdict.dataset.within;
   }
 
-  /** Localise every frame, and say how far the worst is from PyTorch's pose. */
+  /** Localise every frame, and say how far the worst is from Python's pose. */
   async checkAll() {
     const found = [];
-    for (const frame of this.#frames) {
+    for (const frame of this.#contract.frames) {
       const one = await this.#take(frame);
       if (!one) return;
-      found.push(one);
+      found.push(...one);
     }
-    const { position_mm, rotation_deg } = this.#allowed;
-    const [mm, deg] = ["mm", "deg"].map((unit) => Math.max(...found.map((one) => one[unit])));
-    const within = mm <= position_mm && deg <= rotation_deg;
+    const said = ["network", "map"].flatMap((name) => {
+      const own = found.filter((one) => one.name === name);
+      if (!own.length) return [];
+      const [mm, deg] = ["mm", "deg"].map((unit) => small(Math.max(...own.map((one) => one[unit])), 3));
+      const { position_mm, rotation_deg } = own[0].allowed;
+      const limits = `${position_mm} mm and ${rotation_deg}° are allowed`;
+      return [`${name} ${mm} mm and ${deg}° at worst over ${own.length} frames; ${limits}`];
+    });
+    const within = found.every((one) => one.within);
     this.#verdict.dataset.within = String(within);
-    this.#verdict.textContent =
-      `${within ? "Yes" : "No"}: ${small(mm, 3)} mm and ${small(deg, 3)}° at worst over ${found.length} frames; ` +
-      `${position_mm} mm and ${rotation_deg}° are allowed.`;
+    this.#verdict.textContent = `${within ? "Yes" : "No"}:\n${said.join(".\n")}.`;
   }
 
   async #take(frame) {
@@ -51,8 +66,9 @@ export class TestFrames {
     }
     const pose = await this.#localise(frame);
     if (!pose) return null;
-    const found = deviation(pose, frame);
-    this.#list.children[this.#frames.indexOf(frame)].lastChild.textContent = `${small(found.mm, 3).replace(" ", "")} mm`;
+    const found = deviations(pose, frame, this.#contract);
+    const button = this.#list.children[this.#contract.frames.indexOf(frame)];
+    button.lastChild.textContent = `${small(found.at(-1).mm, 3).replace(" ", "")} mm`;
     return found;
   }
 

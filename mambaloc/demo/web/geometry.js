@@ -1,9 +1,7 @@
 /** Poses as numbers: `world_from_cam`, quaternions wxyz, OpenCV camera axes (x right, y down, z forward). No DOM. */
 
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const minus = (a, b, scale = 1) => a.map((value, i) => value - scale * b[i]);
-const unit = (a) => a.map((value) => value / (Math.hypot(...a) || 1));
+import { cross, dot, minus, unit } from "./vectors.js";
+
 const degrees = (radians) => (radians * 180) / Math.PI;
 
 /** One row of `trajectory.json` or `film.json`, as the localiser's answers look. */
@@ -17,6 +15,26 @@ export function rotated([w, x, y, z], vector) {
   const twice = cross(axis, vector).map((value) => 2 * value);
   const turned = cross(axis, twice);
   return vector.map((value, i) => value + w * twice[i] + turned[i]);
+}
+
+/** The rotation of a unit quaternion, nine numbers row by row. */
+export function matrixOf(quaternion) {
+  const [x, y, z] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((axis) => rotated(quaternion, axis));
+  return [x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]];
+}
+
+/** The unit quaternion of a rotation, w of 0 or more. */
+export function quaternionOf([xx, xy, xz, yx, yy, yz, zx, zy, zz]) {
+  // Rows are the quaternion times each of its own numbers; the longest is the most exact.
+  const rows = [
+    [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+    [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
+    [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
+    [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
+  ];
+  const longest = rows.reduce((best, row, i) => (row[i] > rows[best][best] ? i : best), 0);
+  const length = Math.hypot(...rows[longest]) * (rows[longest][0] < 0 ? -1 : 1);
+  return rows[longest].map((value) => value / length);
 }
 
 /**

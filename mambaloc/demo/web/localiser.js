@@ -1,95 +1,73 @@
 /**
- * Poses from pictures with an exported model. No DOM: the same file runs in a browser's worker and in Node.
- *
- * Every step does what `mambaloc/images.py` and `mambaloc/runtime` do with OpenCV, so that a picture looks to the
- * network as it did in training.
+ * Poses from pictures with an exported network, and a sparse map beside it where the bundle has one. No DOM: the same
+ * file runs in a browser's worker and in Node.
  */
+
+import { MapLocaliser } from "./map_localiser.js";
+import { Network } from "./network.js";
 
 const CONTRACT_VERSION = 1;
 const MODELS = ["model.onnx", "model.fp16.onnx", "model.int8.onnx", "model.ort"];
-const UNCERTAINTY = ["position_radius_m", "rotation_radius_deg", "unfamiliarity"];
-const IN_UNIT = Float32Array.from({ length: 256 }, (_, value) => value / 255);
+const LEVEL_SIGMAS = 1.2815515655446004; // nine tenths of a normal variable are below
 
-/** A model on ONNX Runtime. */
+/** A network, and a map. */
 export class Localiser {
-  #ort;
-  #session;
-  #contract;
-  #preprocessor;
+  #network;
+  #map;
 
-  constructor(ort, session, contract) {
-    this.#ort = ort;
-    this.#session = session;
-    this.#contract = contract;
-    this.#preprocessor = new Preprocessor(contract.preprocessing);
+  constructor(network, map = null) {
+    this.#network = network;
+    this.#map = map;
   }
 
   /**
    * @param ort onnxruntime-web or onnxruntime-node.
    * @param {Uint8Array} modelBytes of a model of the bundle.
    * @param {object} contract the parsed `contract.json` beside it.
+   * @param {object|null} map of `readMap`.
    * @param {object} options of the inference session.
    */
-  static async create(ort, modelBytes, contract, options = {}) {
+  static async create(ort, modelBytes, contract, map = null, options = {}) {
     checkContract(contract);
-    return new Localiser(ort, await ort.InferenceSession.create(modelBytes, options), contract);
+    const network = await Network.create(ort, modelBytes, contract, options);
+    return new Localiser(network, map && new MapLocaliser(map));
   }
 
   /**
-   * Localise one picture.
+   * Localise one picture: the map's pose where it is accepted, the network's otherwise.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
-   * @returns `world_from_cam`: the camera centre in metres, a unit quaternion wxyz, and what it took; where the model
-   *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for a picture of elsewhere.
+   * @param {number[][]|null} intrinsics pinhole matrix in its pixels, for the map; the map's camera unless given.
+   * @returns as {@link Network#localise}; and `source`, "map" or "network"; `network`, its own answer; where there is a
+   *   map, `map`, its answer or null, and `map_ms`. Where the map answers, the radii are from its covariance.
    */
-  async localise(image) {
+  async localise(image, intrinsics = null) {
+    const network = await this.#network.localise(image);
+    if (!this.#map) return { ...network, source: "network", network };
     const start = performance.now();
-    const tensor = this.#tensor(image);
-    const fed = performance.now();
-    const found = await this.#session.run({ [this.#contract.input.name]: tensor });
-    const position_m = Array.from(found.position_m.data.slice(0, 3), Number);
-    const quaternion_wxyz = Array.from(found.quaternion_wxyz.data.slice(0, 4), Number);
-    if (![...position_m, ...quaternion_wxyz].every(Number.isFinite)) {
-      throw new Error("The network answered with numbers that are not finite; choose the other backend.");
-    }
-    const told = UNCERTAINTY.filter((name) => name in found).map((name) => [name, Number(found[name].data[0])]);
-    const took = { preprocess_ms: fed - start, network_ms: performance.now() - fed };
-    return { position_m, quaternion_wxyz, ...Object.fromEntries(told), ...took };
-  }
-
-  #tensor(image) {
-    if (this.#contract.preprocessing.in_model) {
-      resizedSize(image, this.#contract.preprocessing);
-      return new this.#ort.Tensor("uint8", asRgb(image), [image.height, image.width, 3]);
-    }
-    const [height, width] = this.#contract.preprocessing.crop;
-    return new this.#ort.Tensor("float32", this.#preprocessor.apply(image), [1, 3, height, width]);
+    const map = this.#map.localise(image, intrinsics, network);
+    const both = { ...network, source: "network", network, map, map_ms: performance.now() - start };
+    if (!map?.isAccepted) return both;
+    const [position, rotation] = [0, 3].map((from) => covarianceRadius(map.covariance, from));
+    return {
+      ...both,
+      source: "map",
+      position_m: map.position_m,
+      quaternion_wxyz: map.quaternion_wxyz,
+      position_radius_m: position,
+      rotation_radius_deg: (rotation * 180) / Math.PI,
+    };
   }
 }
 
-/** What an image goes through before the network sees it; keeps its tables while the pictures' size stays. */
-export class Preprocessor {
-  #preprocessing;
-  #plan = null;
-  #size = "";
-
-  constructor(preprocessing) {
-    this.#preprocessing = preprocessing;
-  }
-
-  /** Resize, crop and scale; (height, width, channels) in 0..255 -> a new float32 (3, *crop) in 0..1. */
-  apply(image) {
-    const { width, height } = image;
-    if (this.#size !== `${width}x${height}`) {
-      this.#plan = plan(image, this.#preprocessing);
-      this.#size = `${width}x${height}`;
-    }
-    return this.#plan.shrinks ? averaged(image, this.#plan) : interpolated(image, this.#plan);
-  }
-}
-
-/** As {@link Preprocessor#apply}, once. */
-export function preprocess(image, preprocessing) {
-  return new Preprocessor(preprocessing).apply(image);
+/**
+ * The radius of the ball that nine of ten errors of a covariance stay in, for three of its rows: Satterthwaite's
+ * approximation, as `mambaloc/runtime/maps/radii.py` has it.
+ */
+function covarianceRadius(covariance, from) {
+  const part = covariance.slice(from, from + 3).map((row) => row.slice(from, from + 3));
+  const mean = part[0][0] + part[1][1] + part[2][2];
+  const share = (2 * part.flat().reduce((sum, value) => sum + value * value, 0)) / (9 * mean * mean);
+  return Math.sqrt(mean * (1 - share + LEVEL_SIGMAS * Math.sqrt(share)) ** 3);
 }
 
 /** How far pose `a` is from pose `b`: millimetres and degrees. */
@@ -117,156 +95,4 @@ export function modelOf(contract) {
   const found = MODELS.find((file) => file in contract.files);
   if (!found) throw new Error(`The bundle holds none of ${MODELS.join(", ")}; export it anew.`);
   return found;
-}
-
-/**
- * [height, width] of an image once its shorter side has `short_side` pixels.
- *
- * Throws where the model's crop does not fit into that.
- */
-export function resizedSize({ width, height }, { short_side, crop }) {
-  const scale = short_side / Math.min(width, height);
-  const size = [roundHalfToEven(height * scale), roundHalfToEven(width * scale)];
-  if (size[0] < crop[0] || size[1] < crop[1]) {
-    const how = width < height ? "turn the camera sideways" : "give a picture shaped as in training";
-    throw new Error(
-      `A picture of ${width}×${height} is too narrow: resized to a short side of ${short_side} it does not hold the ` +
-        `model's crop of ${crop[1]}×${crop[0]}; ${how}.`,
-    );
-  }
-  return size;
-}
-
-function asRgb({ data, width, height, channels }) {
-  if (channels === 3) return data instanceof Uint8Array ? data : new Uint8Array(data);
-  const rgb = new Uint8Array(width * height * 3);
-  for (let from = 0, to = 0; to < rgb.length; from += 4, to += 3) {
-    rgb[to] = data[from];
-    rgb[to + 1] = data[from + 1];
-    rgb[to + 2] = data[from + 2];
-  }
-  return rgb;
-}
-
-/** Which source pixels make each pixel of the crop, along either axis. */
-function plan(image, preprocessing) {
-  const [height, width] = resizedSize(image, preprocessing);
-  const [cropHeight, cropWidth] = preprocessing.crop;
-  const shrinks = height < image.height;
-  const taps = shrinks ? areaTaps : linearTaps;
-  return {
-    shrinks,
-    halves: image.height === 2 * height && image.width === 2 * width,
-    rows: taps(image.height, height, (height - cropHeight) >> 1, cropHeight),
-    columns: taps(image.width, width, (width - cropWidth) >> 1, cropWidth),
-    sums: new Float32Array(3 * cropWidth),
-    bytes: new Uint8ClampedArray(3 * cropWidth), // rounds what is stored, halves to even, as OpenCV does
-  };
-}
-
-/** Overlaps of the pixels' extents, as OpenCV's INTER_AREA counts them. */
-function areaTaps(source, target, first, count) {
-  const scale = 1 / (target / source);
-  const [from, ends, weights] = [new Int32Array(count), new Int32Array(count + 1), []];
-  for (let i = 0; i < count; i++) {
-    const start = (first + i) * scale;
-    const end = start + scale;
-    const cell = Math.min(scale, source - start);
-    const lastWhole = Math.min(Math.floor(end), source - 1);
-    const firstWhole = Math.min(Math.ceil(start), lastWhole);
-    from[i] = firstWhole;
-    if (firstWhole - start > 1e-3) {
-      from[i] -= 1;
-      weights.push((firstWhole - start) / cell);
-    }
-    for (let whole = firstWhole; whole < lastWhole; whole++) weights.push(1 / cell);
-    if (end - lastWhole > 1e-3) weights.push(Math.min(end - lastWhole, 1, cell) / cell);
-    ends[i + 1] = weights.length;
-  }
-  return { from, ends, weights: Float32Array.from(weights) };
-}
-
-/** Weighted sums of areas. Every operation is rounded to float32, as in OpenCV: ties then fall as they do there. */
-function averaged({ data, width, channels }, { rows, columns, sums, bytes, halves }) {
-  const [height, across] = [rows.from.length, columns.from.length];
-  const planes = new Float32Array(3 * height * across);
-  const { fround } = Math;
-  for (let y = 0; y < height; y++) {
-    sums.fill(0);
-    for (let j = rows.ends[y]; j < rows.ends[y + 1]; j++) {
-      const line = (rows.from[y] + j - rows.ends[y]) * width;
-      const share = rows.weights[j];
-      for (let x = 0, to = 0; x < across; x++, to += 3) {
-        let [red, green, blue] = [fround(0), fround(0), fround(0)];
-        let at = (line + columns.from[x]) * channels;
-        for (let i = columns.ends[x]; i < columns.ends[x + 1]; i++, at += channels) {
-          const weight = columns.weights[i];
-          red = fround(red + fround(data[at] * weight));
-          green = fround(green + fround(data[at + 1] * weight));
-          blue = fround(blue + fround(data[at + 2] * weight));
-        }
-        sums[to] = fround(sums[to] + fround(share * red));
-        sums[to + 1] = fround(sums[to + 1] + fround(share * green));
-        sums[to + 2] = fround(sums[to + 2] + fround(share * blue));
-      }
-    }
-    // Where both sides are exactly halved, OpenCV adds four pixels as integers and rounds halves up.
-    for (let i = 0; i < sums.length; i++) bytes[i] = halves ? Math.floor(sums[i] + 0.5) : sums[i];
-    store(bytes, planes, y, height, across);
-  }
-  return planes;
-}
-
-/** Neighbours and their weights in 1/2048, as OpenCV's INTER_LINEAR has them for bytes. */
-function linearTaps(source, target, first, count) {
-  const scale = 1 / (target / source);
-  const [from, weights] = [new Int32Array(count), new Int32Array(2 * count)];
-  for (let i = 0; i < count; i++) {
-    const centre = Math.fround((first + i + 0.5) * scale - 0.5);
-    const floor = Math.floor(centre);
-    const inside = floor >= 0 && floor < source - 1;
-    const share = inside ? Math.fround(centre - floor) : 0;
-    from[i] = Math.min(Math.max(floor, 0), source - 1);
-    weights[2 * i] = roundHalfToEven(2048 * Math.fround(1 - share));
-    weights[2 * i + 1] = roundHalfToEven(2048 * share);
-  }
-  return { from, weights, last: source - 1 };
-}
-
-/** Between four neighbours, in OpenCV's fixed point. */
-function interpolated({ data, width, channels }, { rows, columns, bytes }) {
-  const [height, across] = [rows.from.length, columns.from.length];
-  const planes = new Float32Array(3 * height * across);
-  for (let y = 0; y < height; y++) {
-    const upper = rows.from[y] * width;
-    const lower = Math.min(rows.from[y] + 1, rows.last) * width;
-    for (let x = 0; x < across; x++) {
-      const left = columns.from[x];
-      const right = Math.min(left + 1, columns.last);
-      for (let c = 0; c < 3; c++) {
-        const between = (line) =>
-          data[(line + left) * channels + c] * columns.weights[2 * x] +
-          data[(line + right) * channels + c] * columns.weights[2 * x + 1];
-        const top = (rows.weights[2 * y] * (between(upper) >> 4)) >> 16;
-        const bottom = (rows.weights[2 * y + 1] * (between(lower) >> 4)) >> 16;
-        bytes[3 * x + c] = (top + bottom + 2) >> 2;
-      }
-    }
-    store(bytes, planes, y, height, across);
-  }
-  return planes;
-}
-
-/** Lay one row of RGB bytes out as three planes' rows in 0..1. */
-function store(bytes, planes, y, height, width) {
-  for (let c = 0; c < 3; c++) {
-    for (let x = 0, to = (c * height + y) * width; x < width; x++) planes[to + x] = IN_UNIT[bytes[3 * x + c]];
-  }
-}
-
-/** Python's `round`. */
-function roundHalfToEven(value) {
-  const floor = Math.floor(value);
-  if (value - floor !== 0.5) return Math.round(value);
-  return floor % 2 === 0 ? floor : floor + 1;
 }

@@ -64,20 +64,34 @@ export class Readout {
       const held = attitude(quaternion_wxyz, this.up);
       for (const name of ["heading", "pitch", "roll"]) shown(name).textContent = signed(held[name], 1);
     }
+    this.#showAnswer(pose);
     this.#showUncertainty(pose);
     this.#showSpeed(pose, file || source === "photo");
     data.frame = String((this.#count += 1)); // last: who waits for it finds the rest in place
   }
 
-  /** Show what most poses are within, where the model tells, and whether the picture is of the place at all. */
-  #showUncertainty({ position_radius_m, rotation_radius_deg, unfamiliarity }) {
+  /** Say which of network and map answers, and how many matches agree. */
+  #showAnswer({ source, map }) {
+    const row = document.getElementById("answer");
+    row.hidden = map === undefined;
+    Object.assign(this.#element.dataset, { answer: source, inliers: map?.inliers ?? 0 });
+    shown("answer").textContent = source;
+    const agree = map && `${map.inliers} of ${map.matches.length} matches agree`;
+    shown("answer-detail").textContent = agree || "no pose in the map";
+    row.querySelector(".scale").hidden = source !== "map";
+  }
+
+  /** Show what most poses are within, where that is known, and whether the picture is of the place at all. */
+  #showUncertainty({ source, position_radius_m, rotation_radius_deg, unfamiliarity }) {
     const row = document.getElementById("uncertainty");
-    row.hidden = unfamiliarity === undefined;
+    row.hidden = position_radius_m === undefined;
     if (row.hidden) return;
-    row.dataset.within = String(unfamiliarity <= 1);
-    shown("radius-position").textContent = `±${position_radius_m.toFixed(2)} m`;
-    shown("radius-rotation").textContent = `±${rotation_radius_deg.toFixed(1)}°`;
-    shown("uncertainty-detail").textContent = unfamiliarity > 1 ? "does not look like the place" : "";
+    const [metres, degrees] = source === "map" ? [3, 2] : [2, 1];
+    const isElsewhere = source === "network" && unfamiliarity > 1;
+    row.dataset.within = String(!isElsewhere);
+    shown("radius-position").textContent = `±${position_radius_m.toFixed(metres)} m`;
+    shown("radius-rotation").textContent = `±${rotation_radius_deg.toFixed(degrees)}°`;
+    shown("uncertainty-detail").textContent = isElsewhere ? "does not look like the place" : "";
   }
 
   /** Show how far the film's camera is from its true pose, and the median of the run so far. */
@@ -88,21 +102,21 @@ export class Readout {
     const { mm, deg } = deviation(pose, truth);
     this.#errors.push({ mm, deg });
     const [middleMm, middleDeg] = ["mm", "deg"].map((unit) => median(this.#errors.map((error) => error[unit])));
+    const digits = pose.source === "map" ? 2 : 1;
     const frames = `${this.#errors.length} ${this.#errors.length === 1 ? "frame" : "frames"}`;
     this.#showErrors(
       "Error",
       `${(mm / 1000).toFixed(3)} m`,
-      `${deg.toFixed(1)}°`,
-      `median of ${frames}: ${(middleMm / 1000).toFixed(3)} m, ${middleDeg.toFixed(1)}°`,
+      `${deg.toFixed(digits)}°`,
+      `median of ${frames}: ${(middleMm / 1000).toFixed(3)} m, ${middleDeg.toFixed(digits)}°`,
     );
   }
 
-  /** Show how far a test frame's pose is from the one that PyTorch found. */
-  showDeviation({ mm, deg }, allowed) {
-    const within = mm <= allowed.position_mm && deg <= allowed.rotation_deg;
+  /** Show how far a test frame's pose is from the one that Python found. */
+  showDeviation({ mm, deg, within, allowed }) {
     const limits = `allowed ${allowed.position_mm} mm, ${allowed.rotation_deg}°`;
     this.#showErrors(
-      "From PyTorch",
+      "From Python",
       `${small(mm, 3)} mm`,
       `${small(deg, 3)}°`,
       `${limits}: ${within ? "reproduced" : "not reproduced"}`,
@@ -120,17 +134,17 @@ export class Readout {
     shown("error-detail").textContent = detail;
   }
 
-  #showSpeed({ preprocess_ms, network_ms }, single) {
+  #showSpeed(pose, single) {
     const now = performance.now();
     this.#times = [...this.#times.filter((time) => now - time < RATE_WINDOW_MS), now];
-    this.#latencies = [...this.#latencies.slice(1 - LATENCIES), { preprocess_ms, network_ms }];
-    const [preprocess, network] = ["preprocess_ms", "network_ms"].map((part) =>
-      median(this.#latencies.map((latency) => latency[part])),
-    );
+    this.#latencies = [...this.#latencies.slice(1 - LATENCIES), pose];
+    const parts = ["preprocess_ms", "network_ms", "map_ms"].filter((part) => pose[part] !== undefined);
+    const medians = parts.map((part) => median(this.#latencies.map((latency) => latency[part])));
     const intervals = this.#times.length - 1;
     const fps = (1000 * intervals) / (now - this.#times[0]);
     shown("fps").textContent = intervals > 1 && !single ? fps.toFixed(1) : "–";
-    shown("latency").textContent = (preprocess + network).toFixed(1);
-    shown("latency-detail").textContent = `${preprocess.toFixed(1)} + ${network.toFixed(1)}`;
+    shown("latency").textContent = medians.reduce((a, b) => a + b).toFixed(1);
+    shown("latency-detail").textContent = medians.map((each) => each.toFixed(1)).join(" + ");
+    shown("latency-name").textContent = `Picture + network${parts.length > 2 ? " + map" : ""} (ms)`;
   }
 }

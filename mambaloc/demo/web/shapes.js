@@ -118,6 +118,37 @@ export class Trail {
   }
 }
 
+/** Points of the scene, all of them or those that are chosen. */
+export class Cloud {
+  #points;
+
+  constructor(positions, size, parent) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(Float32Array.from(positions), 3));
+    geometry.setIndex(new THREE.BufferAttribute(Uint32Array.from({ length: positions.length / 3 }, (_, i) => i), 1));
+    const material = new THREE.PointsMaterial({ size, sizeAttenuation: false, map: dot(), alphaTest: 0.5 });
+    this.#points = new THREE.Points(geometry, material);
+    this.#points.frustumCulled = false;
+    parent.add(this.#points);
+  }
+
+  choose(rows) {
+    this.#points.geometry.index.array.set(rows);
+    this.#points.geometry.index.needsUpdate = true;
+    this.#points.geometry.setDrawRange(0, rows.length);
+  }
+
+  paint(colour) {
+    this.#points.material.color.copy(colour);
+  }
+
+  remove() {
+    this.#points.removeFromParent();
+    this.#points.geometry.dispose();
+    this.#points.material.dispose();
+  }
+}
+
 /** A thin rod; WebGL's own lines are one pixel wide, which no phone shows well. */
 export class Rod {
   #radius;

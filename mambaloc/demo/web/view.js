@@ -3,7 +3,7 @@
 import * as THREE from "./vendor/three/three.module.min.js";
 import { poseOf, upOf } from "./geometry.js";
 import { Orbit } from "./orbit.js";
-import { Axes, Camera, Rod, Trail, tube } from "./shapes.js";
+import { Axes, Camera, Cloud, Rod, Trail, tube } from "./shapes.js";
 
 const UP = new THREE.Vector3(0, 1, 0);
 const VIEWPOINT = { theta: 0.6, phi: 1.0 }; // radians about "up", and from it
@@ -17,6 +17,8 @@ export class View {
   #camera = new THREE.PerspectiveCamera(40, 1, 0.01, 1000);
   #world = new THREE.Group(); // the scene's frame; turned so that its "up" is three.js's y
   #paths = new THREE.Group();
+  #sequences;
+  #furniture = new THREE.Group();
   #orbit;
   #asked = false;
   #grid = null;
@@ -25,6 +27,8 @@ export class View {
   #truth;
   #trail;
   #gap;
+  #map = null; // its points, and those that agree with the pose
+  #seen = null;
   #truePath = null;
   #picture = Object.assign(document.createElement("canvas"), { width: PICTURE_WIDTH, height: PICTURE_WIDTH });
   #texture = new THREE.CanvasTexture(this.#picture);
@@ -49,6 +53,7 @@ export class View {
     this.#scene.add(this.#world);
     this.#world.add(this.#paths);
     this.#world.updateMatrixWorld(true);
+    this.#sequences = sequences;
     this.#bounds = boundsOf(sequences, this.#world);
     for (const poses of Object.values(sequences)) this.#paths.add(tube(poses, 0.004 * this.#bounds.radius));
     this.#furnish();
@@ -71,6 +76,21 @@ export class View {
   }
 
   /**
+   * Show a map's points, and stand where they are seen, too; null hides them.
+   * @param {Float64Array|null} points x, y, z one after another.
+   */
+  showMap(points) {
+    this.#bounds = boundsOf(this.#sequences, this.#world, points);
+    this.#furnish();
+    for (const cloud of [this.#map, this.#seen]) cloud?.remove();
+    this.#map = points && new Cloud(points, 2, this.#world);
+    this.#seen = points && new Cloud(points, 4, this.#world);
+    this.#seen?.choose([]);
+    if (this.#canvas.dataset.framed) this.#orbit.frame(this.#bounds.box, VIEWPOINT.theta, VIEWPOINT.phi);
+    this.paint();
+  }
+
+  /**
    * Keep the picture that the next pose is of.
    * @param {CanvasImageSource} source
    */
@@ -88,6 +108,8 @@ export class View {
     this.#texture.needsUpdate = true;
     this.#estimate.place(pose, this.#picture.width / this.#picture.height);
     this.#trail.add(pose.position_m);
+    const agreeing = pose.source === "map" ? pose.map.matches.filter(({ off }) => off <= 1) : [];
+    this.#seen?.choose(agreeing.map(({ point }) => point));
     this.#truth.group.visible = this.#gap.mesh.visible = Boolean(truth);
     if (truth) {
       this.#truth.place(truth);
@@ -103,6 +125,7 @@ export class View {
   /** Forget the camera and its trail. */
   clear() {
     this.#trail.clear();
+    this.#seen?.choose([]);
     this.#estimate.group.visible = this.#truth.group.visible = this.#gap.mesh.visible = false;
     this.#ask();
   }
@@ -121,15 +144,19 @@ export class View {
     this.#truth.paint(colour("--truth"));
     this.#truePath?.material.color.copy(colour("--truth"));
     this.#gap.mesh.material.color.copy(colour("--ink"));
+    this.#map?.paint(colour("--cloud"));
+    this.#seen?.paint(colour("--estimate"));
     this.#trail.paint(colour("--estimate"));
     this.#axes.paint(["--x", "--y", "--z"].map(colour));
     this.#grid.material.color.copy(colour("--grid"));
     this.#ask();
   }
 
-  /** Everything that is not a training path, at a size that suits them. */
+  /** Everything that is not a training path or a map, at a size that suits them. */
   #furnish() {
-    const { radius, centre, floor } = this.#bounds;
+    const { radius, centre, floor, depth } = this.#bounds;
+    this.#furniture.clear();
+    this.#grid?.removeFromParent();
     this.gridStep = niceStep(radius / 2);
     const cells = 2 * Math.ceil((1.3 * radius) / this.gridStep);
     this.#grid = new THREE.GridHelper(cells * this.gridStep, cells, "white", "white");
@@ -138,11 +165,12 @@ export class View {
     this.#scene.add(this.#grid);
     this.#axes = new Axes(0.5 * this.gridStep);
     this.#axes.group.position.copy(this.#world.worldToLocal(this.#grid.position.clone()));
-    this.#estimate = new Camera(0.2 * radius, this.#texture);
-    this.#truth = new Camera(0.12 * radius);
+    this.#estimate = new Camera(depth, this.#texture);
+    this.#truth = new Camera(0.6 * depth);
     this.#trail = new Trail();
     this.#gap = new Rod(0.004 * radius);
-    this.#world.add(this.#axes.group, this.#truth.group, this.#estimate.group, this.#trail.points, this.#gap.mesh);
+    this.#furniture.add(this.#axes.group, this.#truth.group, this.#estimate.group, this.#trail.points, this.#gap.mesh);
+    this.#world.add(this.#furniture);
     this.clear();
   }
 
@@ -174,15 +202,36 @@ export class View {
   }
 }
 
-/** The box that the training cameras stay in, with "up" along y; a few metres where there are none. */
-function boundsOf(sequences, world) {
+/**
+ * The box that the training cameras and the map's points stay in, with "up" along y; a few metres where there are none.
+ * And its centre and radius, the floor's height, and how deep to draw a camera.
+ */
+function boundsOf(sequences, world, points = null) {
   const box = new THREE.Box3();
   for (const [x, y, z] of Object.values(sequences).flat()) {
     box.expandByPoint(world.localToWorld(new THREE.Vector3(x, y, z)));
   }
   if (box.isEmpty()) box.set(new THREE.Vector3(-1, -0.5, -1), new THREE.Vector3(1, 0.5, 1));
+  const { radius: path } = box.getBoundingSphere(new THREE.Sphere());
+  const floor = points ? 0 : 0.35 * path;
+  if (points) box.union(middleOf(points, world));
   const { center, radius } = box.getBoundingSphere(new THREE.Sphere());
-  return { box, centre: center, radius: Math.max(radius, 0.05), floor: box.min.y - 0.35 * radius };
+  const depth = Math.max(0.2 * path, 0.1 * radius, 0.01);
+  return { box, centre: center, radius: Math.max(radius, 0.05), floor: box.min.y - floor, depth };
+}
+
+/** The box of all points but the outermost fiftieth at each end of each axis: a few lie far off. */
+function middleOf(points, world) {
+  const places = Array.from({ length: points.length / 3 }, (_, i) =>
+    world.localToWorld(new THREE.Vector3(points[3 * i], points[3 * i + 1], points[3 * i + 2])),
+  );
+  const box = new THREE.Box3();
+  for (const axis of ["x", "y", "z"]) {
+    const sorted = places.map((place) => place[axis]).sort((a, b) => a - b);
+    const margin = Math.floor(sorted.length / 50);
+    [box.min[axis], box.max[axis]] = [sorted[margin], sorted.at(-1 - margin)];
+  }
+  return box;
 }
 
 /** 1, 2 or 5 times a power of ten, at most `size`. */

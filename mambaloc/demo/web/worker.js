@@ -1,11 +1,12 @@
 /**
- * The network, off the page's thread.
+ * Network and map, off the page's thread.
  *
- * Is sent `{type: "start", backend, threads}` once, then `{type: "localise", id, bitmap}`. Answers with `progress`, `ready`,
- * `pose` and `error`.
+ * Is sent `{type: "start", backend, threads}` once, then `{type: "localise", id, bitmap, intrinsics}`. Answers with
+ * `progress`, `ready`, `pose` and `error`.
  */
 
 import { Localiser, checkContract, modelOf } from "./localiser.js";
+import { readMap } from "./sparse_map.js";
 
 const HERE = new URL("./", import.meta.url);
 const VENDOR = new URL("vendor/onnxruntime-web/", HERE);
@@ -13,6 +14,7 @@ const BACKENDS = {
   wasm: { library: "ort.wasm.min.mjs", binary: "ort-wasm-simd-threaded.wasm" },
   webgpu: { library: "ort.webgpu.min.mjs", binary: "ort-wasm-simd-threaded.asyncify.wasm" },
 };
+const MAP = "map.safetensors";
 const MAX_THREADS = 4;
 const STRIP_PIXELS = 2 ** 22; // iOS gives black, and no error, for canvases of more than 2^24
 const ERRORS_ONLY = 3;
@@ -23,7 +25,10 @@ let context = null;
 self.onmessage = async ({ data }) => {
   try {
     if (data.type === "start") self.postMessage({ type: "ready", ...(await start(data)) });
-    else self.postMessage({ type: "pose", id: data.id, pose: await localiser.localise(pixels(data.bitmap)) });
+    else {
+      const pose = await localiser.localise(pixels(data.bitmap), data.intrinsics);
+      self.postMessage({ type: "pose", id: data.id, pose });
+    }
   } catch (error) {
     self.postMessage({ type: "error", id: data.id, message: error.message });
   }
@@ -36,24 +41,37 @@ async function start({ backend: wanted, threads }) {
   const file = modelOf(contract);
   const model = await fetched(`bundle/${file}`, "model");
   const verified = await checkDigest(file, model, contract.files[file].sha256);
+  const { map, notes } = await openMap(contract);
   const adapter = await webgpuAdapter();
   // An adapter that is imitated on the CPU is slower than WebAssembly: only for those who ask.
   const preferred = wanted === "webgpu" || (wanted !== "wasm" && !adapter?.info?.isFallbackAdapter);
-  const info = { contract, verified, webgpu: Boolean(adapter), note: "" };
+  const info = { contract, verified, webgpu: Boolean(adapter), notes, mapPoints: map?.points_m ?? null };
   if (adapter && preferred) {
     try {
-      return { ...info, ...(await open("webgpu", model, contract, threads)) };
+      return { ...info, ...(await open("webgpu", model, contract, map, threads)) };
     } catch (error) {
-      info.note = `WebAssembly runs the model, for WebGPU cannot here: ${firstLine(error)}`;
+      notes.push(`WebAssembly runs the model, for WebGPU cannot here: ${firstLine(error)}`);
     }
   } else if (wanted === "webgpu") {
-    info.note = "This browser offers no WebGPU, so WebAssembly runs the model.";
+    notes.push("This browser offers no WebGPU, so WebAssembly runs the model.");
   }
-  return { ...info, ...(await open("wasm", model, contract, threads)) };
+  return { ...info, ...(await open("wasm", model, contract, map, threads)) };
+}
+
+/** The bundle's map; null where it has none, and where it cannot be used, which a note then says. */
+async function openMap(contract) {
+  if (!(MAP in contract.files)) return { map: null, notes: [] };
+  try {
+    const bytes = await fetched(`bundle/${MAP}`, "map");
+    await checkDigest(MAP, bytes, contract.files[MAP].sha256);
+    return { map: readMap(bytes), notes: [] };
+  } catch (error) {
+    return { map: null, notes: [`${firstLine(error)} The network answers without the map.`] };
+  }
 }
 
 /** Load one backend, and let the model localise a grey picture: a backend that cannot says so here. */
-async function open(backend, model, contract, most) {
+async function open(backend, model, contract, map, most) {
   const { library, binary } = BACKENDS[backend];
   const ort = await import(new URL(library, VENDOR));
   const cores = self.crossOriginIsolated ? navigator.hardwareConcurrency || 1 : 1;
@@ -63,7 +81,7 @@ async function open(backend, model, contract, most) {
   ort.env.wasm.wasmBinary = await fetched(new URL(binary, VENDOR), "runtime");
   ort.env.logLevel = "error";
   const options = { executionProviders: [backend], logSeverityLevel: ERRORS_ONLY };
-  const opened = await Localiser.create(ort, model, contract, options);
+  const opened = await Localiser.create(ort, model, contract, map, options);
   await opened.localise(grey(contract.preprocessing.crop));
   localiser = opened;
   return { backend, threads };

@@ -74,7 +74,7 @@ class MapLocaliser {
     answer.inliers = int(std::count_if(off.begin(), off.end(), [&](double each) { return each <= near_; }));
     cv::Vec3d variances;
     cv::eigen(answer.covariance.get_minor<3, 3>(0, 0), variances);  // the largest first
-    answer.accepted = answer.inliers >= least_inliers_ && std::sqrt(variances[0]) <= 0.03 * unit_m_;
+    answer.accepted = answer.inliers >= least_inliers_ && std::sqrt(variances[0]) <= 0.04 * unit_m_;
     const auto [given, unsure] = carried(pose, 1);
     answer.pose = given;
     answer.covariance += unsure;

@@ -34,8 +34,9 @@ _GUIDED_RATIO = 0.95
 _GUIDED_FARTHEST = 0.9  # of unit descriptors
 _NEAREST = 8  # key frames whose points are searched again
 _WINDOWS = (6.0, 2.0)  # radii of the guided rounds, in times of what is near
+_PRIOR_WINDOW = 12.0  # likewise, around a prior: 54 px at a width of 160
 _LEAST_SHARE = 0.1
-_MOST_DEVIATION = 0.03  # of the key frames' spread; wrong poses rest on few matches, or on matches in one corner
+_MOST_DEVIATION = 0.04  # of the key frames' spread; wrong poses rest on few matches, or on matches in one corner
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class MapLocalisation:
         position_m: in the map's frame.
         quaternion: likewise.
         inliers: matches that agree with the pose.
-        is_accepted: whether to believe it: there are enough, and they fix the position to 3 % of the spread of the
+        is_accepted: whether to believe it: there are enough, and they fix the position to 4 % of the spread of the
             map's key frames, one standard deviation in the worst direction.
         covariance: of the position in metres, then of the rotation in radians about the fixed axes of the world: the
             order and frame of ROS's PoseWithCovariance. It says how well the matches fix the pose; errors that the
@@ -96,7 +97,7 @@ class MapLocaliser:
         Args:
             image: RGB (H, W, 3) or grey (H, W), ``uint8``, of any size, without distortion.
             intrinsics: (3, 3) pinhole matrix in pixels of it; the map's camera unless given.
-            prior: a pose to search around where all points at once find none, such as a network's.
+            prior: a pose to search around where all points at once find none to accept, such as a network's.
 
         Raises:
             InputError: for another kind of array, intrinsics that do not fit the picture, or none for a picture of
@@ -118,12 +119,19 @@ class MapLocaliser:
         near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
         best, is_clear = unambiguous(features.descriptors @ self._descriptors[self._often].T, _RATIO)
         rng = np.random.default_rng(self.seed)
-        pose = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], near, rng)
-        if pose is None and prior is not None:
-            pose = self.drift.to_adjusted(prior)
-        if pose is None:
+        start = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], near, rng)
+        found = self._settled(features, start, near)
+        if prior is None or found.is_accepted:
+            return found
+        keypoints, points = self._search(features, self.drift.to_adjusted(prior), _PRIOR_WINDOW * near)
+        start = ransac_pose(self._points_m[points], features.rays[keypoints], near, rng)
+        return max(found, self._settled(features, start, near), key=lambda each: (each.is_accepted, each.inliers))
+
+    def _settled(self, features: Features, start: CameraPose | None, near: float) -> MapLocalisation:
+        """Search around a pose and refine it, twice."""
+        if start is None:
             return _nowhere()
-        scale = near / 2  # of the refinement; finer where the matches are
+        pose, scale = start, near / 2  # of the refinement; finer where the matches are
         for window in _WINDOWS:
             keypoints, points = self._search(features, pose, window * near)
             if len(points) < 4:

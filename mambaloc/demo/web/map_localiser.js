@@ -1,0 +1,163 @@
+/** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localiser.py` finds it. No DOM. */
+
+import { project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
+import { LENGTH } from "./descriptors.js";
+import { Drift } from "./drift.js";
+import { matrixOf, median, quaternionOf } from "./geometry.js";
+import { Matcher, matchNearby } from "./matching.js";
+import { greyPicture } from "./pictures.js";
+import { detectFeatures } from "./sift.js";
+import { cameraOf } from "./sparse_map.js";
+import { largestEigenvalue } from "./vectors.js";
+import { spreadOf, squareBetween, viewpoint } from "./viewpoints.js";
+
+const AT_ONCE = 2500; // points, of those that most frames see, which are matched without a pose
+const RATIO = 0.85;
+const GUIDED = { ratio: 0.95, farthest: 0.9 };
+const NEAREST = 8; // key frames whose points are searched again
+const WINDOWS = [6, 2]; // radii of the guided rounds, in times of what is near
+const LEAST_SHARE = 0.1;
+const MOST_DEVIATION = 0.03; // of the key frames' spread
+const LENS_STEPS = 10;
+const SAME = 0.01; // of the width, by which a camera may differ from the map's and still be its own
+
+/** Localises pictures in a map. */
+export class MapLocaliser {
+  #map;
+  #seed;
+  #near; // in the plane at depth 1
+  #unit_m;
+  #viewpoints;
+  #drift;
+  #matcher;
+
+  /**
+   * @param map of `readMap`.
+   * @param {number} seed of RANSAC.
+   */
+  constructor(map, seed = 0) {
+    this.#map = map;
+    this.#seed = seed;
+    this.#near = (4.5 * map.width) / 160 / map.intrinsics.fx;
+    this.#unit_m = spreadOf(map.keyPoses);
+    this.#viewpoints = map.keyPoses.map((pose) => viewpoint(pose, this.#unit_m));
+    this.#matcher = new Matcher(map.descriptors.subarray(0, AT_ONCE * LENGTH));
+    this.#drift = map.drift.length ? new Drift(map.keyPoses, map.drift) : null;
+  }
+
+  /**
+   * Localise one picture.
+   * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number}} image RGB or RGBA.
+   * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the map's camera unless given.
+   * @param prior a pose to search around where all points at once find none.
+   * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `covariance` as in Python, and
+   *   `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers.
+   *   Null where there is no pose, or the picture has another shape than the map's, so that its camera is unknown.
+   */
+  localise(image, intrinsics = null, prior = null) {
+    const camera = intrinsics ? cameraOf(intrinsics.flat()) : this.#cameraFor(image);
+    if (!camera) return null;
+    const grey = greyPicture(image, this.#map.intrinsics.fx / camera.fx);
+    const features = this.#withRays(detectFeatures(grey), grey, rescaled(camera, image, grey));
+    const found = this.#search(features, prior && { ...prior, rotation: matrixOf(prior.quaternion_wxyz) });
+    if (!found) return null;
+    const { pose, covariance, keypoints, points, off } = found;
+    const inliers = off.filter((each) => each <= this.#near).length;
+    const deviation_m = covariance ? Math.sqrt(largestEigenvalue(covariance)) : Infinity;
+    const carried = this.#drift?.toGiven(pose);
+    const { position_m, rotation } = carried?.pose ?? pose;
+    return {
+      position_m,
+      quaternion_wxyz: quaternionOf(rotation),
+      inliers,
+      isAccepted: inliers >= this.#map.about.least_inliers && deviation_m <= MOST_DEVIATION * this.#unit_m,
+      covariance: covariance?.map((row, i) => row.map((value, j) => value + (carried?.unsure[i][j] ?? 0))),
+      matches: keypoints.map((row, i) => ({
+        point: points[i],
+        x: (features.pixels[2 * row] + 0.5) / grey.width,
+        y: (features.pixels[2 * row + 1] + 0.5) / grey.height,
+        off: off[i] / this.#near,
+      })),
+    };
+  }
+
+  /** Match every point at once for a pose, then again around where it projects them. */
+  #search(features, prior) {
+    const { points_m, descriptors } = this.#map;
+    const near = this.#near;
+    const first = this.#matcher.match(features, RATIO);
+    let pose = ransacPose(...this.#matched(features, first), near, this.#seed);
+    if (!pose && prior) pose = this.#drift?.toAdjusted(prior) ?? prior;
+    let [scale, found] = [near / 2, null]; // of the refinement; finer where the matches are
+    for (const window of pose ? WINDOWS : []) {
+      const projected = project(pose, points_m);
+      const limits = { radius: window * near, ...GUIDED };
+      const matches = matchNearby(features, this.#visible(features, pose, projected), projected, descriptors, limits);
+      if (matches.points.length < 4) return null;
+      const [seen_m, rays] = this.#matched(features, matches);
+      found = { ...refinePose(pose, seen_m, rays, scale), ...matches };
+      pose = found.pose;
+      found.off = residuals(pose, seen_m, rays);
+      scale = Math.min(near / 2, Math.max(2.5 * median(found.off.filter(Number.isFinite)), LEAST_SHARE * near));
+    }
+    return found;
+  }
+
+  #matched({ rays }, { keypoints, points }) {
+    return [selected(this.#map.points_m, points, 3), selected(rays, keypoints, 2)];
+  }
+
+  /** Points in the picture that one of the nearest key frames sees: what is hidden from there is not searched. */
+  #visible({ corners: [left, top, right, bottom] }, pose, projected) {
+    const here = viewpoint(pose, this.#unit_m);
+    const apart = this.#viewpoints.map((there) => squareBetween(there, here));
+    const nearest = [...apart.keys()].sort((a, b) => apart[a] - apart[b]).slice(0, NEAREST);
+    const bytes = Math.ceil(this.#viewpoints.length / 8);
+    const visible = [];
+    for (let point = 0; 2 * point < projected.length; point++) {
+      const [x, y] = [projected[2 * point], projected[2 * point + 1]];
+      if (!(x >= left && x <= right && y >= top && y <= bottom)) continue;
+      const sees = (frame) => this.#map.views[point * bytes + (frame >> 3)] & (128 >> (frame & 7));
+      if (nearest.some(sees)) visible.push(point);
+    }
+    return visible;
+  }
+
+  /** Add where keypoints, and the picture's upper left and lower right corner, lie in the plane at depth 1. */
+  #withRays(features, grey, camera) {
+    const { fx, fy, cx, cy } = camera;
+    const { lens, intrinsics, width, height } = this.#map;
+    const rays = features.pixels.map((value, i) => (i % 2 ? (value - cy) / fy : (value - cx) / fx));
+    const isSame = (a, b) => Math.abs(a - b) <= SAME * width;
+    const isOwn = isSame(grey.width, width) && isSame(grey.height, height);
+    if (isOwn && Object.keys(camera).every((name) => isSame(camera[name], intrinsics[name]))) straighten(rays, lens);
+    const end = { x: grey.width - 0.5, y: grey.height - 0.5 };
+    const corners = [(-0.5 - cx) / fx, (-0.5 - cy) / fy, (end.x - cx) / fx, (end.y - cy) / fy];
+    return { ...features, rays, corners };
+  }
+
+  /** The map's camera for a picture of its shape; null for another. */
+  #cameraFor(image) {
+    const { width, height, intrinsics } = this.#map;
+    if (Math.abs(image.width * height - image.height * width) > Math.max(width, height)) return null;
+    return rescaled(intrinsics, this.#map, image);
+  }
+}
+
+/** A camera's intrinsics once a picture is resized; corners stay corners. */
+function rescaled({ fx, fy, cx, cy }, from, to) {
+  const [x, y] = [to.width / from.width, to.height / from.height];
+  return { fx: x * fx, fy: y * fy, cx: x * cx + (x - 1) / 2, cy: y * cy + (y - 1) / 2 };
+}
+
+/** Move rays to where a pinhole would see them, by fixed-point steps. */
+function straighten(rays, { focal, radial }) {
+  for (let i = 0; i < rays.length; i += 2) {
+    const [x, y] = [rays[i] / focal, rays[i + 1] / focal];
+    [rays[i], rays[i + 1]] = [x, y];
+    for (let step = 0; step < LENS_STEPS; step++) {
+      const stretch = 1 + radial * (rays[i] ** 2 + rays[i + 1] ** 2);
+      [rays[i], rays[i + 1]] = [x / stretch, y / stretch];
+    }
+  }
+}
