@@ -26,9 +26,12 @@ def main() -> None:
     parser.add_argument(
         "--split", default="auto", choices=ASKED, help="what to test on; the measured best unless given"
     )
+    parser.add_argument("--adjust-poses", action="store_true", help="also write poses that fit the pictures better")
     args = parser.parse_args()
     command = shlex.join(["python", *sys.argv])
-    imported = import_scene(args.source, args.out, args.format, args.metres_per_unit, args.split, command)
+    imported = import_scene(
+        args.source, args.out, args.format, args.metres_per_unit, args.split, command, args.adjust_poses
+    )
     print_summary(imported, args.out)
     if not imported.verdict.is_usable:
         raise InputError(f"{args.out}: {imported.verdict}; see report.md there, and mend the capture")

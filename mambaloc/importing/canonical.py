@@ -10,12 +10,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mambaloc import provenance
 from mambaloc.data.datasets.capture import COLUMNS, FRAMES_FILE, SCENE_FILE, VERSION, VERSION_KEY
 from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.checks.agreement import Agreement
 from mambaloc.importing.checks.findings import Finding, Verdict
-from mambaloc.importing.motion import quaternions
 from mambaloc.importing.splits.selection import RULE, Chosen, Proposal
+from mambaloc.runtime.rotations import quaternion_from_matrix
+
+ADJUSTED_FILE = "frames_adjusted.csv"
+"""Beside ``frames.csv``, in its form: poses that were adjusted to the pictures. Nothing reads it by itself."""
 
 POSE = (
     "world_from_cam: x, y, z is the camera centre, qw, qx, qy, qz a unit quaternion with qw >= 0; OpenCV camera axes "
@@ -37,6 +44,8 @@ class Imported:
         proposals: ways to split; empty where nothing can be split.
         chosen: the one that was taken.
         left_out: the rule that each frame that was left out breaks, by file.
+        agreement: how pictures agree with poses and camera, where they were compared.
+        adjusted: poses adjusted to the pictures, (N, 4, 4), where they were asked for.
     """
 
     capture: Capture
@@ -47,6 +56,8 @@ class Imported:
     proposals: tuple[Proposal, ...]
     chosen: Chosen | None
     left_out: Mapping[str, str]
+    agreement: Agreement | None = None
+    adjusted: NDArray[np.float64] | None = None
 
     @property
     def unit(self) -> str:
@@ -55,10 +66,17 @@ class Imported:
 
 
 def write_frames(imported: Imported, folder: Path) -> None:
-    """Write ``frames.csv``; numbers as exactly as they are known."""
+    """Write ``frames.csv``, and adjusted poses beside it; numbers as exactly as they are known."""
+    _write_poses(imported, imported.capture.world_from_cam, folder, FRAMES_FILE)
+    if imported.adjusted is not None:
+        _write_poses(imported, imported.adjusted, folder, ADJUSTED_FILE)
+
+
+def _write_poses(imported: Imported, world_from_cam: NDArray[np.float64], folder: Path, name: str) -> None:
     capture = imported.capture
-    poses = zip(capture.world_from_cam[:, :3, 3].tolist(), quaternions(capture).tolist(), strict=True)
-    with (folder / FRAMES_FILE).open("w", newline="", encoding="utf-8") as file:
+    quaternions = quaternion_from_matrix(world_from_cam[:, :3, :3])
+    poses = zip(world_from_cam[:, :3, 3].tolist(), quaternions.tolist(), strict=True)
+    with (folder / name).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for row, (position, quaternion) in enumerate(poses):

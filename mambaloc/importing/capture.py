@@ -38,6 +38,21 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class Depth:
+    """Depth frames of a capture's images, seen from the same place.
+
+    Args:
+        files: of each image the 16-bit PNG, or None; 0 and 65535 are pixels without a measurement.
+        intrinsics: (3, 3), in pixels of depth frames; another lens than the images' where the sensor has one.
+        step: how far one more in a file is, in the capture's unit.
+    """
+
+    files: tuple[Path | None, ...]
+    intrinsics: NDArray[np.float64]
+    step: float = 0.001
+
+
+@dataclass(frozen=True)
 class Capture:
     """Posed images, sequence after sequence, each in the order it was taken.
 
@@ -54,6 +69,7 @@ class Capture:
         split: N of ``train``, ``val``, ``test`` where the format tells of them.
         poses_without_image: what the format names and is not there.
         images_without_pose: images beside those used.
+        depth: of the images, where the format has it and the images are those of a pinhole.
     """
 
     kind: str
@@ -68,3 +84,4 @@ class Capture:
     split: tuple[str, ...] | None = None
     poses_without_image: tuple[str, ...] = ()
     images_without_pose: tuple[Path, ...] = ()
+    depth: Depth | None = None

@@ -15,8 +15,8 @@ from mambaloc.files import whole_folder
 from mambaloc.importing.canonical import Imported, write_frames, write_scene
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.checks import sanity
-from mambaloc.importing.checks.conventions import check_agreement, check_axes, check_up, up_of
-from mambaloc.importing.checks.epipolar import agreement
+from mambaloc.importing.checks.agreement import Agreement, agreement, check_agreement
+from mambaloc.importing.checks.conventions import check_axes, check_up, up_of
 from mambaloc.importing.checks.findings import Finding, verdict_of
 from mambaloc.importing.motion import Motion, motion_of
 from mambaloc.importing.registry import read_capture
@@ -37,6 +37,7 @@ def import_scene(
     metres_per_unit: float | None = None,
     split: str = "auto",
     command: str = "",
+    with_adjusted: bool = False,
 ) -> Imported:
     """Read a capture, check it, split it, and write it as a scene's folder, which appears once it is whole.
 
@@ -47,6 +48,7 @@ def import_scene(
         metres_per_unit: what the format's unit is; as the format tells unless given.
         split: of :data:`~mambaloc.importing.splits.selection.ASKED`.
         command: that this was asked for with.
+        with_adjusted: also write poses that are adjusted to the pictures, in a file of their own.
 
     Raises:
         InputError: for a source that is none, a folder that is there or cannot be written, or a split that cannot be
@@ -66,7 +68,7 @@ def import_scene(
     capture, far = _without(capture, sanity.far_poses(capture.world_from_cam))
     with whole_folder(out, "choose another folder with --out") as partial:
         written, sizes, rules = write_pictures(capture, partial)
-        imported = _checked(written, capture.cameras, sizes, {**broken, **far, **rules}, split)
+        imported = _checked(written, capture.cameras, sizes, {**broken, **far, **rules}, split, with_adjusted)
         write_frames(imported, partial)
         write_report(imported, partial, out.name)
         write_scene(imported, partial, source, command)
@@ -87,7 +89,9 @@ def _in_metres(capture: Capture, metres_per_unit: float | None) -> Capture:
     told = (
         f"multiplied by {metres_per_unit:g}, as --metres-per-unit says; otherwise: {capture.choices.get('scale', '')}"
     )
-    return replace(capture, world_from_cam=world_from_cam, unit="metre", choices={**capture.choices, "scale": told})
+    depth = capture.depth and replace(capture.depth, step=capture.depth.step * metres_per_unit)
+    choices = {**capture.choices, "scale": told}
+    return replace(capture, world_from_cam=world_from_cam, unit="metre", choices=choices, depth=depth)
 
 
 def _near_the_origin(capture: Capture) -> Capture:
@@ -104,7 +108,12 @@ def _near_the_origin(capture: Capture) -> Capture:
 
 
 def _checked(
-    capture: Capture, lenses: Mapping[str, Camera], sizes: Sequence[Size], left_out: Mapping[str, str], asked: str
+    capture: Capture,
+    lenses: Mapping[str, Camera],
+    sizes: Sequence[Size],
+    left_out: Mapping[str, str],
+    asked: str,
+    with_adjusted: bool,
 ) -> Imported:
     """Check what was written, and split what can be used of it."""
     usable = _of_the_usual_shape(sizes)
@@ -112,11 +121,17 @@ def _checked(
     findings = [sanity.check_frames(len(usable), left_out), sanity.check_missing(capture)]
     proposals: list[Proposal] = []
     chosen: Chosen | None = None
+    agreeing: Agreement | None = None
+    adjusted = None
     split = np.full(len(capture.images), "unused", dtype="<U6")
     if not any(finding.is_fatal for finding in findings):
         used = selected(capture, usable)
         motion = motion_of(used)
-        findings += [sanity.check_sizes(sizes, odd), *_of_poses(used, motion)]
+        agreeing = agreement(used, motion, with_adjusted)
+        if agreeing.adjusted is not None:
+            adjusted = capture.world_from_cam.copy()
+            adjusted[usable] = agreeing.adjusted.world_from_cam
+        findings += [sanity.check_sizes(sizes, odd), *check_agreement(agreeing), *_of_poses(used, motion)]
         if not any(finding.is_fatal for finding in findings):
             proposals = propose(used, motion)
             chosen = choose(proposals, asked)
@@ -131,13 +146,14 @@ def _checked(
         proposals=tuple(proposals),
         chosen=chosen,
         left_out=left_out,
+        agreement=agreeing,
+        adjusted=adjusted,
     )
 
 
 def _of_poses(capture: Capture, motion: Motion) -> list[Finding]:
     unit = "m" if capture.unit == "metre" else "units"
     return [
-        check_agreement(agreement(capture, motion)),
         check_up(capture, up_of(capture)),
         check_axes(capture),
         sanity.check_extent(capture, motion, unit),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.formats import arkit, colmap, csv_table, kitti, nerfstudio, pose_folders, tum
+from mambaloc.importing.formats import arkit, colmap, csv_table, kitti, nerfstudio, pose_folders, seven_scenes, tum
 from mambaloc.importing.sfm import structure
 
 
@@ -39,6 +39,11 @@ FORMATS: dict[str, Format] = {
     "polycam": Format("keyframes/cameras/ and images/ of Polycam", arkit.is_polycam, arkit.read_polycam),
     "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd),
     "kitti": Format("poses/ and sequences/", kitti.is_kitti, kitti.read_kitti),
+    "7scenes": Format(
+        "TrainSplit.txt, TestSplit.txt and seq-NN/ of 7-Scenes",
+        seven_scenes.is_seven_scenes,
+        seven_scenes.read_seven_scenes,
+    ),
     "scannet": Format("color/ and pose/", pose_folders.is_scannet, pose_folders.read_scannet),
     "replica": Format("traj.txt and results/", pose_folders.is_replica, pose_folders.read_replica),
     "colmap": Format("cameras, images and points3D", colmap.is_colmap, colmap.read_colmap),

@@ -1,25 +1,32 @@
-"""What was found, for people: ``report.md`` and ``trajectory.png`` in the scene's folder, a table in the terminal."""
+"""What was found, for people: ``report.md`` and its plots in the scene's folder, a table in the terminal."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from mambaloc.importing.canonical import Imported
+from mambaloc.importing.canonical import ADJUSTED_FILE, Imported
+from mambaloc.importing.checks.agreement import Agreement
 from mambaloc.importing.checks.conventions import up_of
+from mambaloc.importing.checks.depth import SCALES
+from mambaloc.importing.checks.epipolar import FOCALS, NEAR_PX, Bin
 from mambaloc.importing.motion import motion_of
 from mambaloc.importing.splits.selection import RULE, Proposal
+from mambaloc.viz.agreement import draw_agreement
 from mambaloc.viz.capture import draw_capture
 
-REPORT_FILE, PLOT_FILE = "report.md", "trajectory.png"
-_IN_TERMINAL = ("frames", "poses", "images and poses", "up", "steps", "extent")
+REPORT_FILE, PLOT_FILE, AGREEMENT_FILE = "report.md", "trajectory.png", "agreement.png"
+_IN_TERMINAL = (
+    "frames", "poses", "images and poses", "focal length", "depth", "adjusted poses", "up", "steps", "extent",
+)  # fmt: skip
 
 
 def write_report(imported: Imported, folder: Path, name: str) -> None:
-    """Write ``report.md`` and ``trajectory.png``.
+    """Write ``report.md``, ``trajectory.png`` and, where pictures were compared with poses, ``agreement.png``.
 
     Args:
         imported: what was found.
@@ -43,6 +50,16 @@ def write_report(imported: Imported, folder: Path, name: str) -> None:
         f"{name}: {len(capture.images)} frames{by}",
         imported.unit,
     )
+    if (found := imported.agreement) is not None and found.is_known:
+        depth = found.depth
+        draw_agreement(
+            [(_between(each), each.share, each.possible, each.adjusted) for each in found.bins],
+            (FOCALS * found.focal_px, found.focal_share, found.focal_px, found.focal * found.focal_px),
+            None if depth is None else (SCALES, depth.focal_px, depth.turn_px),
+            folder / AGREEMENT_FILE,
+            f"{name}: do the poses agree with the pictures?",
+            imported.unit,
+        )
 
 
 def print_summary(imported: Imported, folder: Path) -> None:
@@ -62,7 +79,9 @@ def print_summary(imported: Imported, folder: Path) -> None:
     console.print(_proposals(imported))
     console.print(f"chosen: {imported.chosen.proposal.kind}, {imported.chosen.why}", soft_wrap=True)
     training = f"python tools/train.py recipes/my_scene.yaml --data.scene {folder}"
-    console.print(f"wrote {folder}: {REPORT_FILE}, {PLOT_FILE}; next: {training}", soft_wrap=True, markup=False)
+    console.print(
+        f"wrote {folder}: {REPORT_FILE}, {PLOT_FILE}, {AGREEMENT_FILE}; next: {training}", soft_wrap=True, markup=False
+    )
 
 
 _TABLE_TITLE = "from test frames to the nearest training frame"
@@ -107,6 +126,8 @@ def _page(imported: Imported, name: str) -> str:
     capture = imported.capture
     parts = [f"# {name}", _verdict(imported), f"![Cameras from above and from the side]({PLOT_FILE})", "## Found"]
     parts.append(_table(("check", "found"), [(finding.name, finding.said) for finding in imported.findings]))
+    if imported.agreement is not None and imported.agreement.is_known:
+        parts += _of_agreement(imported.agreement, imported.unit)
     parts.append("## Split")
     if imported.chosen is None:
         parts.append("None: nothing can be split.")
@@ -129,6 +150,47 @@ def _page(imported: Imported, name: str) -> str:
         parts.append("## Left out")
         parts.append(_table(("image", "rule"), [(Path(file).name, rule) for file, rule in imported.left_out.items()]))
     return "\n\n".join(parts) + "\n"
+
+
+def _of_agreement(found: Agreement, unit: str) -> list[str]:
+    """The section on poses and pictures."""
+    header = ["baseline", "turn", "pairs", "matches", "agree", "could agree"]
+    rows = [
+        [f"{_between(each)} {unit}", f"{each.turn_deg:.0f}°", str(each.pairs), str(each.matches), f"{each.share:.0%}",
+         f"{each.possible:.0%}"]
+        for each in found.bins
+    ]  # fmt: skip
+    parts = [
+        "## Poses and pictures",
+        f"![Matches that agree, by baseline and by focal length]({AGREEMENT_FILE})",
+        f"A match agrees where it lies within {NEAR_PX:g} px of the line that the poses draw for it, were the longer "
+        "side of the pictures 640 px. It could agree where a pose fitted to its two pictures alone explains it: the "
+        "rest is wrongly matched. Where much less agrees than could, poses or intrinsics are off.",
+    ]
+    if found.adjusted is not None:
+        header.append("agree, adjusted")
+        for row, each in zip(rows, found.bins, strict=True):
+            row.append(f"{each.adjusted:.0%}")
+    parts.append(_table(tuple(header), [tuple(row) for row in rows]))
+    parts.append(
+        "The focal length is tried with the poses as they are. A focal length that is too long and turns that are too "
+        "small look alike in matches"
+        + ("; depth tells them apart better." if found.depth else ", unless there is depth.")
+    )
+    if (adjusted := found.adjusted) is not None:
+        held = "the given poses and depth" if adjusted.with_depth else "the given poses"
+        parts.append(
+            f"`{ADJUSTED_FILE}` has adjusted poses, which nothing uses unless it is renamed to `frames.csv`. They are "
+            f"held by {held}: pictures alone prefer turns that are too small where baselines are small, and bend the "
+            f"map. Here turns between frames are {adjusted.turns:.3g} of those given."
+        )
+    return parts
+
+
+def _between(each: Bin) -> str:
+    if np.isinf(each.high):
+        return f"over {each.low:g}"
+    return f"{each.low:g} to {each.high:g}" if each.low else f"under {each.high:g}"
 
 
 def _verdict(imported: Imported) -> str:

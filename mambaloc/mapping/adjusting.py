@@ -2,7 +2,8 @@
 
 Given poses drift, so that no points fit all pictures that were posed with them. Adjusted poses do. How far each moved
 is the drift, and :mod:`mambaloc.runtime.maps.drift` carries answers back to the frame of the given poses. From pictures
-alone small baselines would bend the map, so the given poses and the given camera are priors.
+alone small baselines would bend the map, so the given poses and the given camera are priors, and so are depths where
+they were measured.
 
 Levenberg-Marquardt on the reduced camera system (Triggs et al. 2000, section 6.1): points are eliminated, and one dense
 system of six unknowns a camera and two of the lens is left.
@@ -30,6 +31,7 @@ _AT_ONCE = 512  # points that are eliminated together
 _FOCAL, _RADIAL = 0.02, 0.05  # one standard deviation of the prior
 _FIXED = 1e-9
 _LEAST_DEPTH = 1e-3  # of the cameras' spread
+_DEPTH = 0.02  # of a measured depth, one standard deviation
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ def adjust(
     seen: Observations,
     sigma: float,
     is_lens_free: bool,
+    depth_m: Floats | None = None,
     is_fixed: NDArray[np.bool_] | None = None,
 ) -> Bundle:
     """Move cameras, points and the lens to where points project to what is seen, with Cauchy's weights.
@@ -70,9 +73,11 @@ def adjust(
         seen: rays as the claimed intrinsics have them.
         sigma: an observation that is off by so much, in the plane at depth 1, has half the weight.
         is_lens_free: whether the lens is adjusted.
+        depth_m: measured along the optical axis, of each observation (O,); NaN where it was not.
         is_fixed: points that stay where they are, (T,); none unless given.
     """
-    problem = _Problem(given, drift, seen, sigma, is_lens_free)
+    depth_m = np.full(len(seen), np.nan) if depth_m is None else depth_m
+    problem = _Problem(given, drift, seen, sigma, is_lens_free, depth_m)
     if is_fixed is not None:
         problem.is_fixed = is_fixed[seen.track]
     now, cost, damping = start, problem.cost(start), _DAMPING
@@ -101,10 +106,18 @@ class _Problem:
     """Observations and priors, both in units of their standard deviations."""
 
     def __init__(
-        self, given: Floats, drift: tuple[float, float], seen: Observations, sigma: float, is_lens_free: bool
+        self,
+        given: Floats,
+        drift: tuple[float, float],
+        seen: Observations,
+        sigma: float,
+        is_lens_free: bool,
+        depth_m: Floats,
     ) -> None:
         self.given, self.seen, self.sigma = given, seen, sigma
         self.is_fixed = np.zeros(len(seen), bool)
+        self.is_measured = np.isfinite(depth_m)
+        self.depth_m = np.where(self.is_measured, depth_m, np.inf)[:, None]  # infinite, so that it weighs nothing
         self.least_depth = _LEAST_DEPTH * spread_m(given)
         camera = np.repeat(drift, 3)
         lens = np.array((_FOCAL, _RADIAL)) * (1 if is_lens_free else _FIXED)
@@ -120,12 +133,17 @@ class _Problem:
         return np.concatenate((moves(self.given, at.world_from_cam).ravel(), at.lens.numbers - Lens().numbers))
 
     def _project(self, at: Bundle) -> tuple[Floats, Floats, Floats, Floats]:
-        """Residuals (O, 2), from cameras to points in the world (O, 3), ideal rays (O, 2), and depths (O, 1)."""
+        """Residuals (O, 3), from cameras to points in the world (O, 3), ideal rays (O, 2), and depths (O, 1).
+
+        A residual is two of the ray and one of the depth.
+        """
         towards = at.points_m[self.seen.track] - at.world_from_cam[self.seen.frame, :3, 3]
         cam = np.einsum("oji,oj->oi", at.world_from_cam[self.seen.frame, :3, :3], towards)
         depth = np.maximum(cam[:, 2:], self.least_depth)
         ideal = cam[:, :2] / depth
-        return (at.lens.distort(ideal) - self.seen.rays) / self.sigma, towards, ideal, depth
+        of_ray = (at.lens.distort(ideal) - self.seen.rays) / self.sigma
+        of_depth = np.where(self.is_measured[:, None], (depth / self.depth_m - 1) / _DEPTH, 0.0)
+        return np.hstack((of_ray, of_depth)), towards, ideal, depth
 
     def linearized(self, at: Bundle) -> _Equations:
         """Normal equations at a bundle."""
@@ -133,10 +151,12 @@ class _Problem:
         weight = 1 / np.sqrt(1 + (off**2).sum(axis=1))[:, None, None]
         inverse = at.world_from_cam[self.seen.frame, :3, :3].transpose(0, 2, 1)
         by_ray, by_lens = at.lens.slopes(ideal)
-        by_point = by_ray @ (inverse[:, :2] - ideal[..., None] * inverse[:, 2:]) / depth[..., None]
+        of_ray = by_ray @ (inverse[:, :2] - ideal[..., None] * inverse[:, 2:]) / depth[..., None] / self.sigma
+        by_point = np.concatenate((of_ray, inverse[:, 2:] / (_DEPTH * self.depth_m[..., None])), axis=1)
+        by_lens = np.concatenate((by_lens / self.sigma, np.zeros((len(depth), 1, 2))), axis=1)
         # A turn by θ about the world's axes moves a point, as the camera sees it, by -θ x towards.
         by_camera = np.concatenate((-by_point, by_point @ _cross(towards)), axis=-1)
-        by_camera, by_lens, by_point = (weight / self.sigma * each for each in (by_camera, by_lens, by_point))
+        by_camera, by_lens, by_point = (weight * each for each in (by_camera, by_lens, by_point))
         by_point[self.is_fixed] = 0
         return _Equations(self, by_camera, by_lens, by_point, weight * off[..., None], self.moves(at))
 

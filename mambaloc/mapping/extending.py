@@ -76,7 +76,7 @@ def extend(
             start, is_fixed = Bundle(poses, every_m, Lens()), tracks < len(sparse_map)
             sigma = _SIGMA * near_px * unit_px / focal_px
             prior = poses if given is None else given
-            poses = adjust(start, prior, drift, both, sigma, False, is_fixed).world_from_cam
+            poses = adjust(start, prior, drift, both, sigma, False, is_fixed=is_fixed).world_from_cam
     descriptors, views = mean_descriptors(features, len(points_m), seen, keypoint)
     order = np.argsort(-views.sum(axis=1), kind="stable")
     old = np.zeros((len(sparse_map), len(features)), bool)

@@ -23,6 +23,9 @@ from mambaloc.runtime.rotations import matrix_from_quaternion
 Floats = NDArray[np.floating[Any]]
 
 _MOST_NAMED = 8
+# Times the inliers that an answer needs: a wrong pose that is built on misleads later ones, and a frame that has few of
+# them has more once its neighbours were added.
+_INLIERS = 3
 _FARTHEST, _FARTHEST_DEG = 0.25, 15.0  # of the key frames' spread; by how much a given pose may be off
 
 
@@ -139,7 +142,7 @@ def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -
     for row in rows:
         given = frames[row].given
         located = localiser.localise_features(frames[row].features, given)
-        if located.is_accepted:
+        if located.is_accepted and located.inliers >= _INLIERS * sparse_map.least_inliers:
             pose = CameraPose(matrix_from_quaternion(located.quaternion), located.position_m)
             if given is None or _agree(pose, given, unit_m):
                 found[row] = localiser.drift.to_adjusted(pose)

@@ -54,6 +54,7 @@ def recover_structure(
     pairs: Indices,
     matches: Sequence[Indices],
     rng: np.random.Generator,
+    depth_m: Sequence[Floats] | None = None,
 ) -> Structure:
     """Triangulate with the given poses, adjust poses and lens, and triangulate again.
 
@@ -63,6 +64,7 @@ def recover_structure(
         pairs: of frames that were matched, (E, 2).
         matches: rows of keypoints of both frames of each pair.
         rng: draws views.
+        depth_m: of each frame's keypoints along the optical axis, NaN where it was not measured.
     """
     unit_px = features[0].size[0] / 160
     focal_px = features[0].intrinsics[0, 0]
@@ -76,7 +78,8 @@ def recover_structure(
         if not len(points):
             break
         sigma = _SIGMA_PX * unit_px / focal_px
-        bundle = adjust(Bundle(poses, points, Lens()), given, drift, seen, sigma, is_first and is_one_camera)
+        measured = None if depth_m is None else np.concatenate(depth_m)[keypoint]
+        bundle = adjust(Bundle(poses, points, Lens()), given, drift, seen, sigma, is_first and is_one_camera, measured)
         poses = bundle.world_from_cam
         shift_m, turn_rad = np.sqrt((moves(given, poses).reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
         drift = (min(drift[0], 2 * shift_m), min(drift[1], 2 * turn_rad))

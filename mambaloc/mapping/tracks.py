@@ -32,18 +32,18 @@ def sampson_distance(second_from_first: Floats, first: Floats, second: Floats) -
     """How far matches are from their epipolar line, to first order.
 
     Args:
-        second_from_first: transform between the cameras, (4, 4), with a translation other than 0.
+        second_from_first: transform between the cameras, (4, 4), or of each match, (M, 4, 4); its translation is not 0.
         first: points in the plane at depth 1 of the first camera, (M, 2).
         second: in the second's.
 
     Returns:
         Distances in that plane, (M,).
     """
-    rotation, shift = second_from_first[:3, :3], second_from_first[:3, 3]
+    rotation, shift = second_from_first[..., :3, :3], second_from_first[..., :3, 3]
     ones = np.ones((len(first), 1))
     start, end = np.hstack((first, ones)), np.hstack((second, ones))
-    lines = np.cross(shift, start @ rotation.T)
-    lines_back = np.cross(end, shift) @ rotation
+    lines = np.cross(shift, (rotation @ start[..., None])[..., 0])
+    lines_back = (np.cross(end, shift)[:, None] @ rotation)[:, 0]
     slope = (lines[:, :2] ** 2).sum(axis=1) + (lines_back[:, :2] ** 2).sum(axis=1)
     return np.abs((end * lines).sum(axis=1)) / np.sqrt(np.maximum(slope, np.finfo(float).tiny))
 

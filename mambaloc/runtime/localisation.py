@@ -57,24 +57,26 @@ class Localisation:
 
 
 def combined(network: Localisation | None, found: MapLocalisation) -> Localisation:
-    """The map's pose where it is accepted, otherwise the network's, otherwise none.
+    """The map's pose where it is accepted, or where the network's confirms it; otherwise the network's, otherwise none.
 
-    Everything that has both a network and a map decides here: apps' runtime, evaluation and benchmarks.
+    Everything that has both a network and a map decides here: apps' runtime, evaluation and benchmarks. Where a pose is
+    only confirmed, the network's radii stand.
 
     Args:
         network: its answer; None where there is no network.
-        found: the map's answer about the same image.
+        found: the map's answer about the same image, with the network's pose as prior.
     """
     lost = Localisation(np.full(3, np.nan), np.full(4, np.nan), 0.0, source=None)
     base = replace(network or lost, inliers=found.inliers)
-    if not found.is_accepted:
+    if not (found.is_accepted or found.is_confirmed):
         return base
+    answer = replace(
+        base, position_m=found.position_m, quaternion=found.quaternion, source="map", covariance=found.covariance
+    )
+    if not found.is_accepted:
+        return answer
     return replace(
-        base,
-        position_m=found.position_m,
-        quaternion=found.quaternion,
+        answer,
         position_radius_m=covariance_radius(found.covariance[:3, :3]),
         rotation_radius_deg=float(np.degrees(covariance_radius(found.covariance[3:, 3:]))),
-        source="map",
-        covariance=found.covariance,
     )

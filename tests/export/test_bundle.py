@@ -215,6 +215,8 @@ def test_native_apps_decide_as_python_does():
             maps_localiser._LEAST_SHARE,
             maps_localiser._MOST_DEVIATION,
         ),
+        *(maps_localiser._PRIOR_WINDOW, maps_localiser._CONFIRMED_INLIERS, maps_localiser._CONFIRMED_DEVIATION),
+        *(maps_localiser._CONFIRMED_MOVE, maps_localiser._CONFIRMED_TURN_DEG),
         *(near_px(160), drift._LENGTH, drift._NUGGET, viewpoints._TURN_DEG, lens._STEPS),
         *(absolute_pose._TRIALS, absolute_pose._CONFIDENCE, absolute_pose._STEPS),
         *(features._MOST_KEYPOINTS, features._CONTRAST, sparse_map.VERSION),

@@ -20,6 +20,7 @@ from mambaloc.errors import InputError
 from mambaloc.importing.registry import FORMATS, read_capture
 
 PICTURE = cv2.imencode(".png", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
+DEPTH = cv2.imencode(".png", np.ones((4, 6), np.uint16))[1].tobytes()
 EYE12 = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 EYE16 = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 LENS = {"w": 6, "h": 4, "fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0}
@@ -41,6 +42,17 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
         ("poses/00.txt", "sequences/00/calib.txt", "sequences/00/times.txt", "sequences/00/image_2/000000.png"),
     ),
     "kitti_poses": ({"poses.txt": EYE12 * 2, "1.png": PICTURE, "2.png": PICTURE}, ("poses.txt",)),
+    "7scenes": (
+        {
+            "TrainSplit.txt": "sequence1\n",
+            "TestSplit.txt": "sequence2\n",
+            "camera-intrinsics.txt": "5 0 3\n0 5 2\n0 0 1\n",
+        }
+        | {f"seq-0{k}/frame-000000.color.png": PICTURE for k in (1, 2)}
+        | {f"seq-0{k}/frame-000000.pose.txt": EYE16 for k in (1, 2)}
+        | {"seq-01/frame-000000.depth.png": DEPTH},
+        ("TrainSplit.txt", "seq-01/frame-000000.pose.txt", "seq-01/frame-000000.depth.png", "camera-intrinsics.txt"),
+    ),
     "scannet": (
         {f"color/{k}.png": PICTURE for k in (1, 2)}
         | {f"pose/{k}.txt": EYE16 for k in (1, 2)}

@@ -55,7 +55,7 @@ def tool(*words):
 
 def test_a_scene_holds_what_it_should(scene):
     assert sorted(path.name for path in scene.iterdir()) == [
-        "frames.csv", "images", "report.md", "scene.json", "trajectory.png",
+        "agreement.png", "frames.csv", "images", "report.md", "scene.json", "trajectory.png",
     ]  # fmt: skip
     assert scene.stat().st_mode & 0o777 == 0o755
     assert read_image(scene / "trajectory.png").shape[0] > 200
@@ -151,6 +151,50 @@ def test_a_world_far_away_is_shifted(rendered, tmp_path):
         np.diff(poses[:, :3], axis=0), np.diff(rendered.world_from_cam[:, :3, 3], axis=0), atol=1e-8
     )
     assert "shifted to [449999.0, 5200000.0" in told(tmp_path / "a")["choices"]["origin"]
+
+
+def test_the_report_compares_poses_with_pictures(scene):
+    report, checks = (scene / "report.md").read_text(), told(scene)["sanity"]["checks"]
+    assert "## Poses and pictures" in report
+    assert "![Matches that agree, by baseline and by focal length](agreement.png)" in report
+    bins = checks["images and poses"]["by_baseline"]
+    assert sum(each["matches"] for each in bins) > 1000
+    assert all(0 < each["share"] <= each["possible"] <= 1 for each in bins)
+    assert bins[-1]["high"] is None
+    assert abs(checks["focal length"]["best_over_given"] - 1) < 0.03
+
+
+def test_adjusted_poses_are_written_beside_the_given(rendered, tmp_path):
+    """The given poses are off by a seeded 5 mm and 0.3 deg; the adjusted must be nearer to the truth."""
+    rng = np.random.default_rng(0)
+
+    def disturb(said):
+        for frame in said["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, :3] = Rotation.from_rotvec(np.radians(0.3) * rng.normal(size=3)).as_matrix() @ pose[:3, :3]
+            pose[:3, 3] += 0.005 * rng.normal(size=3)
+            frame["transform_matrix"] = pose.tolist()
+
+    rendered.edit(disturb)
+    tool(rendered.folder, "--out", tmp_path / "scene", "--adjust-poses")
+    off = {}
+    for name in ("frames.csv", "frames_adjusted.csv"):
+        with (tmp_path / "scene" / name).open() as file:
+            rows = list(csv.DictReader(file))
+        position = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
+        turn = Rotation.from_quat([[float(row[axis]) for axis in ("qx", "qy", "qz", "qw")] for row in rows])
+        apart = turn.inv() * Rotation.from_matrix(rendered.world_from_cam[:, :3, :3])
+        distance = np.linalg.norm(position - rendered.world_from_cam[:, :3, 3], axis=1)
+        off[name] = distance.mean(), np.degrees(apart.magnitude()).mean()
+    given, adjusted = off.values()
+    assert adjusted[0] < 0.8 * given[0]
+    assert adjusted[1] < 0.6 * given[1]
+    said = told(tmp_path / "scene")["sanity"]["checks"]
+    assert all(each["adjusted"] > each["share"] for each in said["images and poses"]["by_baseline"][:2])
+    assert 0 < said["adjusted poses"]["moved"] < 0.03
+    report = (tmp_path / "scene/report.md").read_text()
+    assert "nothing uses unless it is renamed" in report
+    assert "pictures alone prefer turns that are too small" in report
 
 
 # --- what captures really look like ----------------------------------------------------------------------------------

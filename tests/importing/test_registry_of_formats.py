@@ -13,6 +13,7 @@ FILES = {
     "polycam": ["keyframes/cameras/1.json", "keyframes/images/1.jpg", "mesh_info.json", "polycam.mp4"],
     "tum_rgbd": ["rgb.txt", "depth.txt", "groundtruth.txt", "accelerometer.txt", "rgb/1.2.png"],
     "kitti": ["poses/00.txt", "sequences/00/image_2/000000.png", "sequences/00/calib.txt"],
+    "7scenes": ["TrainSplit.txt", "TestSplit.txt", "seq-01/frame-000000.color.png", "seq-01/frame-000000.pose.txt"],
     "scannet": ["color/0.jpg", "pose/0.txt", "depth/0.png", "intrinsic/intrinsic_color.txt"],
     "replica": ["traj.txt", "results/frame000000.jpg", "results/depth000000.png"],
     "colmap": ["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin", "images/a.jpg"],

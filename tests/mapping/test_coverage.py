@@ -72,7 +72,7 @@ def test_the_deviation_is_that_of_numerical_derivatives(box):
 def test_it_ranks_which_frames_are_found(part, film_of):
     """Frames anywhere in the room, most of them lost. Measured: AUC of 0.84, rank correlation of 0.82.
 
-    Rendered walls are matched from further around than real ones: all 7 that are above 0.2 are found, and 13 of 33 at 0.
+    Rendered walls are matched from further around than real ones: all 7 above 0.2 are found, and 13 of 33 at 0.
     """
     rng, count = np.random.default_rng(3), 40
     place, azimuth = rng.uniform((-1.5, -1.2, 1), (1.5, 1.2, 1.8), (count, 3)), rng.uniform(-np.pi, np.pi, count)

@@ -1,5 +1,7 @@
 """Which answer counts, and how far off it may be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -27,6 +29,13 @@ def test_an_accepted_pose_of_the_map_is_the_answer():
     assert answer.rotation_radius_deg == pytest.approx(np.degrees(0.02) * metres_per_deviation, rel=0.01)
     assert NETWORK.is_unfamiliar
     assert not answer.is_unfamiliar  # the map has seen that it is the place
+
+
+def test_a_pose_that_the_network_confirms_is_the_answer_with_the_networks_radii():
+    answer = combined(NETWORK, replace(found(False), is_confirmed=True))
+    assert (answer.source, answer.inliers) == ("map", 23)
+    assert answer.position_m.tolist() == [4, 5, 6]
+    assert (answer.position_radius_m, answer.rotation_radius_deg) == (0.5, 9.0)
 
 
 def test_otherwise_the_network_answers_with_its_own_radii():

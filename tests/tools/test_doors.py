@@ -32,6 +32,8 @@ def test_a_sweep_is_planned(tool, tmp_path, capsys):
         (["sweep", "run", "none.yaml"], "none.yaml"),
         (["sweep", "report", "none"], "none: holds no result"),
         (["benchmarks/uncertainty", "none.ckpt"], "none.ckpt"),
+        (["benchmarks/maps", "robustness", "none.yaml"], "none.yaml"),
+        (["benchmarks/maps", "report", "none", "--out", "figure.png"], "measure it with maps.py robustness"),
         (["benchmarks/soak", "none.yaml"], "none.yaml: no such recipe"),
         (["benchmarks/scenes", "none"], "none: holds none of"),
         (["benchmarks/loading", "--dataset", "7scenes", "--root", "none"], "none"),

@@ -25,7 +25,8 @@ from mambaloc.types import Pose
 INTRINSICS_FILE = "camera-intrinsics.txt"
 _OFFICIAL_INTRINSICS = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])
 _OFFICIAL_SIZE = (640, 480)
-_NO_DEPTH_MM = (0, 65535)
+NO_DEPTH_MM = (0, 65535)
+"""What a depth frame has at pixels without a measurement."""
 
 
 def depth_path(image: Path) -> Path:
@@ -54,8 +55,8 @@ def read_depth_points(folder: Path, frames: Frames, count: int, seed: int) -> Sc
         InputError: for a depth frame that cannot be read or is of another size than the first, or bad intrinsics.
     """
     rows = depth_rows(frames)
-    size = _size(_read_depth_mm(depth_path(frames.image_paths[rows[0]])))
-    intrinsics = _read_intrinsics(folder, size)
+    size = _size(read_depth_mm(depth_path(frames.image_paths[rows[0]])))
+    intrinsics = read_depth_intrinsics(folder, size)
     points: list[Points] = [np.empty((0, 3))] * len(frames)
     with ThreadPoolExecutor() as pool:
         sampled = pool.map(lambda row: _sample(frames, row, intrinsics, size, count, seed), rows)
@@ -69,7 +70,12 @@ def read_depth_points(folder: Path, frames: Frames, count: int, seed: int) -> Sc
     return ScenePoints(stacked(points, count), cameras, size, "depth")
 
 
-def _read_depth_mm(path: Path) -> NDArray[np.uint16]:
+def read_depth_mm(path: Path) -> NDArray[np.uint16]:
+    """Read a depth frame, (H, W).
+
+    Raises:
+        InputError: where it is no whole 16-bit PNG of one channel.
+    """
     try:
         data = path.read_bytes()
         # OpenCV fills what a truncated file lacks with zeros and says nothing.
@@ -87,8 +93,12 @@ def _size(depth_mm: NDArray[np.uint16]) -> tuple[int, int]:
     return width, height
 
 
-def _read_intrinsics(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The camera of depth frames of a size (width, height)."""
+def read_depth_intrinsics(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
+    """The camera of depth frames of a size (width, height), (3, 3).
+
+    Raises:
+        InputError: where the folder's file of it is no pinhole matrix.
+    """
     path = folder / INTRINSICS_FILE
     if not path.is_file():
         scale = (size[0] / _OFFICIAL_SIZE[0], size[1] / _OFFICIAL_SIZE[1])
@@ -108,11 +118,11 @@ def _sample(
 ) -> Points:
     """World points of pixels drawn from those that have a depth, (K, 3)."""
     image = frames.image_paths[row]
-    depth_mm = _read_depth_mm(depth_path(image))
+    depth_mm = read_depth_mm(depth_path(image))
     if _size(depth_mm) != size:
         sizes = f"{depth_mm.shape[1]}x{depth_mm.shape[0]}, where the first depth frame is {size[0]}x{size[1]}"
         raise InputError(f"{depth_path(image)}: is {sizes}; resize it, or remove it to do without it")
-    measured = np.flatnonzero(~np.isin(depth_mm, _NO_DEPTH_MM))
+    measured = np.flatnonzero(~np.isin(depth_mm, NO_DEPTH_MM))
     drawn = frame_rng(seed, image).choice(measured, min(count, len(measured)), replace=False, shuffle=False)
     y, x = np.divmod(drawn, size[0])
     rays = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(intrinsics).T

@@ -34,11 +34,11 @@ export class Localiser {
   }
 
   /**
-   * Localise one picture: the map's pose where it is accepted, the network's otherwise.
+   * Localise one picture: the map's pose where it is accepted or the network confirms it, the network's otherwise.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels, for the map; the map's camera unless given.
    * @returns as {@link Network#localise}; and `source`, "map" or "network"; `network`, its own answer; where there is a
-   *   map, `map`, its answer or null, and `map_ms`. Where the map answers, the radii are from its covariance.
+   *   map, `map`, its answer or null, and `map_ms`. Where the map's pose is accepted, the radii are from its covariance.
    */
   async localise(image, intrinsics = null) {
     const network = await this.#network.localise(image);
@@ -46,16 +46,12 @@ export class Localiser {
     const start = performance.now();
     const map = this.#map.localise(image, intrinsics, network);
     const both = { ...network, source: "network", network, map, map_ms: performance.now() - start };
-    if (!map?.isAccepted) return both;
+    if (!map?.isAccepted && !map?.isConfirmed) return both;
+    const { position_m, quaternion_wxyz } = map;
+    const answer = { ...both, source: "map", position_m, quaternion_wxyz };
+    if (!map.isAccepted) return answer;
     const [position, rotation] = [0, 3].map((from) => covarianceRadius(map.covariance, from));
-    return {
-      ...both,
-      source: "map",
-      position_m: map.position_m,
-      quaternion_wxyz: map.quaternion_wxyz,
-      position_radius_m: position,
-      rotation_radius_deg: (rotation * 180) / Math.PI,
-    };
+    return { ...answer, position_radius_m: position, rotation_radius_deg: (rotation * 180) / Math.PI };
   }
 }
 

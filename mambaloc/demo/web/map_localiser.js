@@ -16,8 +16,10 @@ const RATIO = 0.85;
 const GUIDED = { ratio: 0.95, farthest: 0.9 };
 const NEAREST = 8; // key frames whose points are searched again
 const WINDOWS = [6, 2]; // radii of the guided rounds, in times of what is near
+const PRIOR_WINDOW = 12; // likewise, around a prior
 const LEAST_SHARE = 0.1;
-const MOST_DEVIATION = 0.03; // of the key frames' spread
+const MOST_DEVIATION = 0.04; // of the key frames' spread
+const CONFIRMED = { inliers: 8, deviation: 0.06, move: 0.5, turn_deg: 15 }; // lengths of the key frames' spread
 const LENS_STEPS = 10;
 const SAME = 0.01; // of the width, by which a camera may differ from the map's and still be its own
 
@@ -49,9 +51,9 @@ export class MapLocaliser {
    * Localise one picture.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the map's camera unless given.
-   * @param prior a pose to search around where all points at once find none.
-   * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `covariance` as in Python, and
-   *   `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers.
+   * @param prior a pose to search around where all points at once find none to accept.
+   * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `isConfirmed`, `covariance` as in
+   *   Python, and `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers.
    *   Null where there is no pose, or the picture has another shape than the map's, so that its camera is unknown.
    */
   localise(image, intrinsics = null, prior = null) {
@@ -59,48 +61,58 @@ export class MapLocaliser {
     if (!camera) return null;
     const grey = greyPicture(image, this.#map.intrinsics.fx / camera.fx);
     const features = this.#withRays(detectFeatures(grey), grey, rescaled(camera, image, grey));
-    const found = this.#search(features, prior && { ...prior, rotation: matrixOf(prior.quaternion_wxyz) });
-    if (!found) return null;
-    const { pose, covariance, keypoints, points, off } = found;
-    const inliers = off.filter((each) => each <= this.#near).length;
-    const deviation_m = covariance ? Math.sqrt(largestEigenvalue(covariance)) : Infinity;
+    const near = this.#near;
+    const [seen_m, rays] = this.#matched(features, this.#matcher.match(features, RATIO));
+    const found = this.#settled(features, grey, ransacPose(seen_m, rays, near, this.#seed));
+    if (!prior || found?.isAccepted) return found;
+    const around = { ...prior, rotation: matrixOf(prior.quaternion_wxyz) };
+    const matches = this.#search(features, this.#drift?.toAdjusted(around) ?? around, PRIOR_WINDOW * near);
+    const guided = ransacPose(...this.#matched(features, matches), near, this.#seed);
+    const both = [found, this.#settled(features, grey, guided)].filter(Boolean);
+    for (const each of both) each.isConfirmed = isConfirmed(each, prior, this.#unit_m);
+    const rank = (each) => 1e6 * each.isAccepted + 1e5 * each.isConfirmed + each.inliers;
+    return both.reduce((best, each) => (best && rank(best) >= rank(each) ? best : each), null);
+  }
+
+  /** Search around a pose and refine it, twice; null where that is lost. */
+  #settled(features, grey, start) {
+    if (!start) return null;
+    const near = this.#near;
+    let [pose, scale] = [start, near / 2]; // of the refinement; finer where the matches are
+    let [matches, covariance, off] = [null, null, null];
+    for (const window of WINDOWS) {
+      matches = this.#search(features, pose, window * near);
+      if (matches.points.length < 4) return null;
+      const [seen_m, rays] = this.#matched(features, matches);
+      ({ pose, covariance } = refinePose(pose, seen_m, rays, scale));
+      off = residuals(pose, seen_m, rays);
+      scale = Math.min(near / 2, Math.max(2.5 * median(off.filter(Number.isFinite)), LEAST_SHARE * near));
+    }
+    const inliers = off.filter((each) => each <= near).length;
+    const isFixed = deviationOf(covariance) <= MOST_DEVIATION * this.#unit_m;
     const carried = this.#drift?.toGiven(pose);
     const { position_m, rotation } = carried?.pose ?? pose;
     return {
       position_m,
       quaternion_wxyz: quaternionOf(rotation),
       inliers,
-      isAccepted: inliers >= this.#map.about.least_inliers && deviation_m <= MOST_DEVIATION * this.#unit_m,
+      isAccepted: isFixed && inliers >= this.#map.about.least_inliers,
+      isConfirmed: false,
       covariance: covariance?.map((row, i) => row.map((value, j) => value + (carried?.unsure[i][j] ?? 0))),
-      matches: keypoints.map((row, i) => ({
-        point: points[i],
+      matches: matches.keypoints.map((row, i) => ({
+        point: matches.points[i],
         x: (features.pixels[2 * row] + 0.5) / grey.width,
         y: (features.pixels[2 * row + 1] + 0.5) / grey.height,
-        off: off[i] / this.#near,
+        off: off[i] / near,
       })),
     };
   }
 
-  /** Match every point at once for a pose, then again around where it projects them. */
-  #search(features, prior) {
-    const { points_m, descriptors } = this.#map;
-    const near = this.#near;
-    const first = this.#matcher.match(features, RATIO);
-    let pose = ransacPose(...this.#matched(features, first), near, this.#seed);
-    if (!pose && prior) pose = this.#drift?.toAdjusted(prior) ?? prior;
-    let [scale, found] = [near / 2, null]; // of the refinement; finer where the matches are
-    for (const window of pose ? WINDOWS : []) {
-      const projected = project(pose, points_m);
-      const limits = { radius: window * near, ...GUIDED };
-      const matches = matchNearby(features, this.#visible(features, pose, projected), projected, descriptors, limits);
-      if (matches.points.length < 4) return null;
-      const [seen_m, rays] = this.#matched(features, matches);
-      found = { ...refinePose(pose, seen_m, rays, scale), ...matches };
-      pose = found.pose;
-      found.off = residuals(pose, seen_m, rays);
-      scale = Math.min(near / 2, Math.max(2.5 * median(found.off.filter(Number.isFinite)), LEAST_SHARE * near));
-    }
-    return found;
+  /** Match again what a pose projects within a radius of a keypoint. */
+  #search(features, pose, radius) {
+    const projected = project(pose, this.#map.points_m);
+    const visible = this.#visible(features, pose, projected);
+    return matchNearby(features, visible, projected, this.#map.descriptors, { radius, ...GUIDED });
   }
 
   #matched({ rays }, { keypoints, points }) {
@@ -142,6 +154,20 @@ export class MapLocaliser {
     if (Math.abs(image.width * height - image.height * width) > Math.max(width, height)) return null;
     return rescaled(intrinsics, this.#map, image);
   }
+}
+
+/** The deviation of the position in metres, in the direction that is least sure. */
+function deviationOf(covariance) {
+  return covariance ? Math.sqrt(largestEigenvalue(covariance)) : Infinity;
+}
+
+/** Whether a prior is near a pose that has a few matches. */
+function isConfirmed({ position_m, quaternion_wxyz, inliers, covariance }, prior, unit_m) {
+  const isFixed = deviationOf(covariance) <= CONFIRMED.deviation * unit_m && inliers >= CONFIRMED.inliers;
+  const move = Math.hypot(...position_m.map((value, i) => value - prior.position_m[i])) / unit_m;
+  const cosine = Math.abs(quaternion_wxyz.reduce((sum, value, i) => sum + value * prior.quaternion_wxyz[i], 0));
+  const turn_deg = (2 * Math.acos(Math.min(1, cosine)) * 180) / Math.PI;
+  return isFixed && move <= CONFIRMED.move && turn_deg <= CONFIRMED.turn_deg;
 }
 
 /** A camera's intrinsics once a picture is resized; corners stay corners. */

@@ -2,7 +2,7 @@
 //
 //   mambaloc::MapLocaliser localiser(bytes);                   // of the file; throws std::exception
 //   auto found = localiser.localise(rgb, intrinsics, &prior);  // prior: the network's pose, or nullptr
-//   if (found.accepted) use(found); else use(network);
+//   if (found.accepted || found.confirmed) use(found); else use(network);
 //
 // Poses are world_from_cam: metres; OpenCV camera axes (x right, y down, z forward). One object serves any thread.
 // Each step is that of mambaloc/runtime/maps in Python; INTEGRATION.md says how to check it with the bundle's frames.
@@ -17,6 +17,8 @@
 #include <numeric>
 #include <stdexcept>
 #include <string>
+#include <tuple>
+#include <utility>
 #include <vector>
 
 #include <opencv2/calib3d.hpp>
@@ -39,6 +41,7 @@ struct MapLocalisation {
   CameraPose pose;
   int inliers = 0;
   bool accepted = false;
+  bool confirmed = false;  // by a prior that is near
   // Position in metres, then rotation in radians about the world's axes: the order and frame of ROS.
   cv::Matx66d covariance;
 };
@@ -50,40 +53,27 @@ class MapLocaliser {
   // rgb: CV_8UC3, upright, of any size. intrinsics: in its pixels; the centre of the top-left pixel is (0, 0).
   MapLocalisation localise(const cv::Mat& rgb, const cv::Matx33d& intrinsics, const CameraPose* prior = nullptr) const {
     const Features seen = detect(rgb, intrinsics);
-    MapLocalisation answer;
-    CameraPose pose;
-    if (!ransac(seen, pose)) {
-      if (!prior) return answer;
-      pose = carried(*prior, -1).first;
+    std::vector<cv::Vec3d> points;
+    std::vector<cv::Vec2d> rays;
+    match(seen, points, rays);
+    const MapLocalisation found = settled(seen, points, rays);
+    if (!prior || found.accepted) return found;
+    points.clear(), rays.clear();
+    search(seen, carried(*prior, -1).first, 12.0 * near_, points, rays);
+    MapLocalisation both[] = {found, settled(seen, points, rays)};
+    for (auto& each : both) {
+      const double move = cv::norm(each.pose.position_m - prior->position_m) / unit_m_;
+      cv::Vec3d turn;
+      cv::Rodrigues(each.pose.rotation.t() * prior->rotation, turn);
+      each.confirmed = each.inliers >= 8 && deviation(each) <= 0.06 * unit_m_ && move <= 0.5 && cv::norm(turn) * 180 / CV_PI <= 15.0;
     }
-    double scale = near_ / 2;
-    std::vector<double> off;
-    for (double window : {6.0, 2.0}) {
-      std::vector<cv::Vec3d> points;
-      std::vector<cv::Vec2d> rays;
-      search(seen, pose, window * near_, points, rays);
-      if (points.size() < 4) return answer;
-      answer.covariance = refine(pose, points, rays, scale);
-      off.clear();
-      for (size_t i = 0; i < points.size(); ++i) off.push_back(cv::norm(project(pose, points[i]) - rays[i]));
-      std::vector<double> sorted = off;
-      std::sort(sorted.begin(), sorted.end());
-      const double median = (sorted[(sorted.size() - 1) / 2] + sorted[sorted.size() / 2]) / 2;
-      scale = std::min(near_ / 2, std::max(2.5 * median, 0.1 * near_));
-    }
-    answer.inliers = int(std::count_if(off.begin(), off.end(), [&](double each) { return each <= near_; }));
-    cv::Vec3d variances;
-    cv::eigen(answer.covariance.get_minor<3, 3>(0, 0), variances);  // the largest first
-    answer.accepted = answer.inliers >= least_inliers_ && std::sqrt(variances[0]) <= 0.04 * unit_m_;
-    const auto [given, unsure] = carried(pose, 1);
-    answer.pose = given;
-    answer.covariance += unsure;
-    return answer;
+    const auto rank = [](const MapLocalisation& each) { return std::make_tuple(each.accepted, each.confirmed, each.inliers); };
+    return rank(both[1]) > rank(both[0]) ? both[1] : both[0];
   }
 
   // For a bridge to another language: height x width x 3 bytes, R G B; fx, fy, cx, cy in its pixels, or nullptr for the
   // map's own camera; the network's pose as x y z qw qx qy qz, or nullptr. Returns the same 7 numbers, the inliers, and
-  // the covariance's 36; nothing where no pose is accepted, or the map's own camera does not have the picture's shape.
+  // the covariance's 36; nothing where no pose is accepted or confirmed, or the map's own camera does not have the picture's shape.
   std::vector<double> localise(const uint8_t* rgb, int height, int width, const double* camera, const double* prior) const {
     if (!camera && std::abs(width * size_.height - height * size_.width) > std::max(size_.width, size_.height)) return {};
     const cv::Matx33d k = camera ? cv::Matx33d(camera[0], 0, camera[2], 0, camera[1], camera[3], 0, 0, 1)
@@ -98,7 +88,7 @@ class MapLocaliser {
     }
     const cv::Mat picture(height, width, CV_8UC3, const_cast<uint8_t*>(rgb));
     const MapLocalisation found = localise(picture, k, prior ? &around : nullptr);
-    if (!found.accepted) return {};
+    if (!found.accepted && !found.confirmed) return {};
     cv::Vec3d turn;
     cv::Rodrigues(found.pose.rotation, turn);
     const double angle = cv::norm(turn), share = angle > 1e-12 ? std::sin(angle / 2) / angle : 0.5;
@@ -187,13 +177,50 @@ class MapLocaliser {
     return best;
   }
 
-  bool ransac(const Features& seen, CameraPose& pose) const {
-    if (seen.rays.empty()) return false;
+  // Of the position, in the direction that is least sure.
+  static double deviation(const MapLocalisation& found) {
+    cv::Vec3d variances;
+    cv::eigen(found.covariance.get_minor<3, 3>(0, 0), variances);  // the largest first
+    return std::sqrt(variances[0]);
+  }
+
+  // Match the points that most frames see, all at once.
+  void match(const Features& seen, std::vector<cv::Vec3d>& points, std::vector<cv::Vec2d>& rays) const {
+    if (seen.rays.empty()) return;
     const std::vector<int> best = unambiguous(seen.descriptors * often_descriptors_.t(), 0.85f);
-    std::vector<cv::Vec3d> points;
-    std::vector<cv::Vec2d> rays;
     for (size_t i = 0; i < best.size(); ++i)
       if (best[i] >= 0) points.push_back(points_[often_[best[i]]]), rays.push_back(seen.rays[i]);
+  }
+
+  // RANSAC; then search around the pose and refine it, twice.
+  MapLocalisation settled(const Features& seen, const std::vector<cv::Vec3d>& matched, const std::vector<cv::Vec2d>& at) const {
+    MapLocalisation answer;
+    CameraPose pose;
+    if (!ransac(matched, at, pose)) return answer;
+    double scale = near_ / 2;
+    std::vector<double> off;
+    for (double window : {6.0, 2.0}) {
+      std::vector<cv::Vec3d> points;
+      std::vector<cv::Vec2d> rays;
+      search(seen, pose, window * near_, points, rays);
+      if (points.size() < 4) return MapLocalisation();
+      answer.covariance = refine(pose, points, rays, scale);
+      off.clear();
+      for (size_t i = 0; i < points.size(); ++i) off.push_back(cv::norm(project(pose, points[i]) - rays[i]));
+      std::vector<double> sorted = off;
+      std::sort(sorted.begin(), sorted.end());
+      const double median = (sorted[(sorted.size() - 1) / 2] + sorted[sorted.size() / 2]) / 2;
+      scale = std::min(near_ / 2, std::max(2.5 * median, 0.1 * near_));
+    }
+    answer.inliers = int(std::count_if(off.begin(), off.end(), [&](double each) { return each <= near_; }));
+    answer.accepted = answer.inliers >= least_inliers_ && deviation(answer) <= 0.04 * unit_m_;
+    const auto [given, unsure] = carried(pose, 1);
+    answer.pose = given;
+    answer.covariance += unsure;
+    return answer;
+  }
+
+  bool ransac(const std::vector<cv::Vec3d>& points, const std::vector<cv::Vec2d>& rays, CameraPose& pose) const {
     if (points.size() < 4) return false;
     cv::Vec3d turn, shift;
     std::vector<int> inliers;

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.checks.epipolar import AS_READ, Agreement
 from mambaloc.importing.checks.findings import Finding
 
 Floats = NDArray[np.float64]
@@ -17,9 +16,6 @@ _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _UPRIGHT_DEG = 20.0
 _COMMON = 0.5  # length of the mean of unit vectors that still have a direction in common
 _ON_THEIR_SIDE = 0.2
-_LEAST_MATCHES = 200
-_AGREE = 0.5
-_PLAINLY = 0.2
 _IN_FRONT = 0.9
 
 
@@ -107,36 +103,6 @@ def check_axes(capture: Capture) -> Finding:
     where = "in front of" if in_front >= _IN_FRONT else "behind" if in_front <= 1 - _IN_FRONT else "before and behind"
     said = f"meet {where} the cameras, missing a point by {share:.0%} of its distance (median)"
     return Finding("optical axes", said, figures=figures)
-
-
-def check_agreement(found: Agreement) -> Finding:
-    """Say whether images and poses agree, and in which convention they would."""
-    figures = {
-        "matches": found.matches,
-        "pairs": found.pairs,
-        "share": {name: round(share, 4) for name, share in found.share.items()},
-        "focal_length_guessed": found.is_guessed,
-    }
-    name = "images and poses"
-    if found.matches < _LEAST_MATCHES:
-        return Finding(name, f"not compared: {found.matches} matches on {found.pairs} pairs of images", figures=figures)
-    share, best = found.share[AS_READ], found.best
-    others = max(share for name, share in found.share.items() if name != AS_READ)
-    guessed = ", focal length guessed" if found.is_guessed else ""
-    said = f"{share:.0%} of {found.matches} matches on {found.pairs} pairs agree{guessed} (otherwise: {others:.0%})"
-    if best != AS_READ and found.share[best] >= _AGREE and found.share[best] > share + _PLAINLY:
-        concern = (
-            f"the poses look like {best}: {found.share[best]:.0%} of matches agree with that, "
-            f"{share:.0%} with them {AS_READ}"
-        )
-        return Finding(name, said, concern, figures=figures)
-    if share < _AGREE and not found.is_guessed:
-        concern = (
-            f"only {share:.0%} of matches between images agree with the poses: these may be inaccurate, or of other "
-            "images, or the camera's intrinsics wrong"
-        )
-        return Finding(name, said, concern, figures=figures)
-    return Finding(name, said, figures=figures)
 
 
 def _angle_deg(cosine: Floats | float) -> Floats:

@@ -1,166 +1,158 @@
-"""Whether images and poses speak of the same cameras: matched points must lie on the lines that the poses draw.
+"""Which matches between pictures agree with a capture's poses and its camera, or with others in their stead.
 
-No pose file says for sure in which direction its poses transform, nor which way its cameras look. Pairs of images do:
-in the right convention nearly every match lies near its epipolar line, and in front of both cameras.
+A pair of poses draws a line in one picture for each point of the other. Where poses, pictures and camera belong
+together nearly every match lies near its line, and in front of both cameras.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
-from mambaloc.images import Image, read_image
-from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
-from mambaloc.importing.motion import Motion, apart, quaternions
+from mambaloc.importing.checks.matching import Matches
+from mambaloc.mapping.tracks import sampson_distance
+from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
+NEAR_PX = 1.5
+"""How far a match may be from its line, were the longer side of the pictures 640 pixels."""
 
-def _inverse(pose: Floats) -> Floats:
-    return np.linalg.inv(pose).astype(np.float64)
+FOCALS = np.round(1.0125 ** np.arange(-28, 28), 4)
+"""Focal lengths that are tried, over that of the capture."""
 
-
-AS_READ = "as they were read"
-CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
-    AS_READ: lambda pose: pose,
-    "world to camera": _inverse,
-    "camera to world in OpenGL's axes": lambda pose: pose @ OPENCV_FROM_OPENGL,
-    "world to camera in OpenGL's axes": lambda pose: _inverse(pose) @ OPENCV_FROM_OPENGL,
-}
-"""What makes ``world_from_cam`` in OpenCV's axes of a pose that was meant otherwise."""
-
-_PAIRS = 16
-_OFFSETS = (32, 24, 16, 12, 8, 6, 4, 3, 2, 1)  # frames from one of a pair to the other; far apart they tell more
-_MOST_TURN_DEG = 15.0
-_LEAST_MOVE = 0.01  # of the extent; turned on the spot, a camera draws no lines
-_LONG_SIDE = 640
-_FEATURES = 1500
-_LOWE_RATIO = 0.75
-_NEAR_PX = 2.0
-_GUESSED_FOCAL = 0.85  # of the longer side, as a phone's
+_LEAST_OF_A_PAIR = 20  # matches; poses fitted to fewer agree with too many
+_MOST_BINS = 6
+_FOCAL_TURN_DEG = 8.0  # of pairs by which the focal length is judged: errors of poses grow with their turns
+_FOCAL_MATCHES = 400
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """How many matches agree with the poses.
+class Bin:
+    """Pairs of pictures that are about as far apart.
 
     Args:
-        share: of the matches, by convention.
-        matches: in all pairs.
-        pairs: of images.
-        is_guessed: the focal length was guessed, since none is told.
+        low: shortest baseline, in the capture's unit.
+        high: longest.
+        turn_deg: median.
+        pairs: that have enough matches.
+        matches: of these.
+        share: of the matches that agree with the capture's poses.
+        possible: that agree with the poses, or with one fitted to each pair alone.
+        adjusted: that agree with adjusted poses, where there are some.
     """
 
-    share: dict[str, float]
-    matches: int
+    low: float
+    high: float
+    turn_deg: float
     pairs: int
-    is_guessed: bool
-
-    @property
-    def best(self) -> str:
-        """The convention that most matches agree with."""
-        return max(self.share, key=self.share.__getitem__)
+    matches: int
+    share: float
+    possible: float
+    adjusted: float | None = None
 
 
-@dataclass(frozen=True)
-class _View:
-    """An image's features: rays (K, 2), what they look like (K, 128), and how wide a pixel of the image is in rays."""
-
-    rays: Floats
-    descriptors: NDArray[np.float32]
-    pixel: float
-
-
-def agreement(capture: Capture, motion: Motion) -> Agreement:
-    """Match pairs of images, spread over the capture, and count what agrees with each convention.
+def agrees(matches: Matches, world_from_cam: Floats, focal: float = 1.0) -> NDArray[np.bool_]:
+    """Which matches lie near their epipolar line and in front of both cameras, (M,).
 
     Args:
-        capture: its images are those of pinholes, where it tells of cameras.
-        motion: its.
+        matches: between pictures of N frames.
+        world_from_cam: of each frame, (N, 4, 4).
+        focal: focal length over that of the matches' camera.
     """
-    pairs, agreeing, matches = _pairs(capture, motion), dict.fromkeys(CONVENTIONS, 0), 0
-    for pair in track(pairs, "Comparing images with poses", console=Console(stderr=True), transient=True):
-        first, second = (_view(read_image(capture.images[row]), _camera(capture, row)) for row in pair)
-        rays = _matched(first, second)
-        matches += len(rays[0])
-        for name, meant in CONVENTIONS.items():
-            poses = [meant(capture.world_from_cam[row]) for row in pair]
-            second_from_first = np.linalg.inv(poses[1]) @ poses[0]
-            agreeing[name] += int(agrees(second_from_first, *rays, _NEAR_PX * max(first.pixel, second.pixel)).sum())
-    share = {name: count / max(1, matches) for name, count in agreeing.items()}
-    return Agreement(share, matches, len(pairs), capture.camera_of is None)
+    first_from_world, second_from_world = np.linalg.inv(world_from_cam[matches.pairs.T])
+    relative = second_from_world @ np.linalg.inv(first_from_world)
+    second_from_first = relative[matches.pair]
+    first, second = matches.first / focal, matches.second / focal
+    near = NEAR_PX / (focal * matches.focal_px[matches.pair])
+    has_moved = relative[:, :3, 3].any(axis=1)[matches.pair]
+    is_near = sampson_distance(second_from_first, first, second) <= near
+    return is_near & has_moved & _in_front(second_from_first, first, second, near)
 
 
-def agrees(second_from_first: Floats, first: Floats, second: Floats, near: float) -> NDArray[np.bool_]:
-    """Which matches lie near their epipolar line (Sampson's distance) and in front of both cameras, (M,).
+def by_baseline(matches: Matches, world_from_cam: Floats, adjusted: Floats | None = None) -> list[Bin]:
+    """The share of matches that agree by how far pictures are apart, with the most that any poses could reach.
 
     Args:
-        second_from_first: transform between the cameras, (4, 4).
-        first: rays in the first camera, (M, 2).
-        second: in the second.
-        near: the line, in rays.
+        matches: between pictures of N frames.
+        world_from_cam: of each frame, (N, 4, 4).
+        adjusted: other poses of the frames, in the same bins.
     """
-    rotation, shift = second_from_first[:3, :3], second_from_first[:3, 3]
-    ones = np.ones((len(first), 1))
-    start, end = np.hstack((first, ones)), np.hstack((second, ones))
-    turned = start @ rotation.T
-    lines, lines_back = np.cross(shift, turned), np.cross(end, shift) @ rotation
-    slope = (lines[:, :2] ** 2).sum(1) + (lines_back[:, :2] ** 2).sum(1)
-    is_near = (end * lines).sum(1) ** 2 <= near**2 * slope
-    between = np.cross(turned, end)
-    # Depths along both rays where they pass closest; unknown where the rays are parallel to a pixel.
-    from_second = (between * np.cross(turned, shift)).sum(1)
-    from_first = (between * np.cross(end, shift)).sum(1)
-    is_parallel = np.linalg.norm(between, axis=1) <= near * np.linalg.norm(turned, axis=1) * np.linalg.norm(end, axis=1)
-    return is_near & (slope > 0) & (is_parallel | ((from_second > 0) & (from_first > 0)))
-
-
-def _pairs(capture: Capture, motion: Motion) -> list[tuple[int, int]]:
-    """Frames that see much of the same from apart: the farthest of the next ones that is turned little."""
-    position, quaternion, every = capture.world_from_cam[:, :3, 3], quaternions(capture), np.arange(len(capture.images))
+    counts = matches.per_pair()
+    enough = np.flatnonzero(counts >= _LEAST_OF_A_PAIR)
+    if not len(enough):
+        return []
+    agreeing = matches.per_pair(agrees(matches, world_from_cam))
+    possible = np.array([max(_fitted(matches, pair), agreeing[pair]) for pair in enough.tolist()])
+    counts, agreeing = counts[enough], agreeing[enough]
+    after = None if adjusted is None else matches.per_pair(agrees(matches, adjusted))[enough]
+    baseline, turn_deg = (each[enough] for each in apart_of(matches, world_from_cam))
+    edges = _round_edges(baseline)
     found = []
-    for row in every[:: max(1, len(every) // (4 * _PAIRS))]:
-        others = [row + offset for offset in _OFFSETS if row + offset < len(every)] if motion.in_order else every
-        others = np.array(
-            [other for other in others if capture.sequences[other] == capture.sequences[row]], dtype=np.int64
-        )
-        length, turn_deg = (each[0] for each in apart(position, quaternion, every[row : row + 1], others))
-        fits = np.flatnonzero((turn_deg <= _MOST_TURN_DEG) & (length >= _LEAST_MOVE * motion.extent))
-        if len(fits):
-            place = fits[0] if motion.in_order else fits[length[fits].argmin()]
-            found.append((int(row), int(others[place])))
-    chosen = np.linspace(0, len(found) - 1, min(_PAIRS, len(found))).round().astype(int)
-    return [found[place] for place in chosen]
+    for low, high in pairwise(edges):
+        here = (baseline >= low) & (baseline < high)
+        if not (total := int(counts[here].sum())):
+            continue
+        share, most = float(agreeing[here].sum() / total), float(possible[here].sum() / total)
+        share_after = None if after is None else float(after[here].sum() / total)
+        middle_deg = float(np.median(turn_deg[here]))
+        found.append(Bin(low, high, middle_deg, int(here.sum()), total, share, most, share_after))
+    return found
 
 
-def _camera(capture: Capture, row: int) -> Camera | None:
-    return capture.cameras[capture.camera_of[row]] if capture.camera_of is not None else None
+def by_focal(matches: Matches, world_from_cam: Floats) -> Floats:
+    """The share of matches that agree at each of :data:`FOCALS`, by pairs turned little where there are some."""
+    little = np.flatnonzero(apart_of(matches, world_from_cam)[1] <= _FOCAL_TURN_DEG)
+    judged = matches.of_pairs(little)
+    judged = judged if len(judged.pair) >= _FOCAL_MATCHES else matches
+    return np.array([agrees(judged, world_from_cam, focal).mean() for focal in FOCALS])
 
 
-def _view(image: Image, camera: Camera | None) -> _View:
-    height, width = image.shape[:2]
-    if camera is None:
-        focal_px = _GUESSED_FOCAL * max(height, width)
-        camera = Camera(width, height, (focal_px, focal_px), ((width - 1) / 2, (height - 1) / 2))
-    scale = min(1.0, _LONG_SIDE / max(height, width))
-    small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    points, found = cv2.SIFT.create(_FEATURES).detectAndCompute(small, None)
-    descriptors = np.empty((0, 128), np.float32) if found is None else np.asarray(found, dtype=np.float32)
-    pixels = (np.array([point.pt for point in points], dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
-    return _View((pixels - camera.centre_px) / camera.focal_px, descriptors, 1 / (camera.focal_px[0] * scale))
+def best_focal(share: Floats) -> float:
+    """Where the parabola through the highest share and its neighbours has its peak, over the capture's focal length."""
+    at = int(np.clip(share.argmax(), 1, len(FOCALS) - 2))
+    below, here, above = share[at - 1 : at + 2]
+    bend = below - 2 * here + above
+    offset = float(np.clip((below - above) / (2 * bend), -1, 1)) if bend < 0 else float(share.argmax() - at)
+    return float(FOCALS[at] * (FOCALS[at + 1] / FOCALS[at]) ** offset)
 
 
-def _matched(first: _View, second: _View) -> tuple[Floats, Floats]:
-    """Rays of features that look like each other more than like any third, (M, 2) each."""
-    if min(len(first.rays), len(second.rays)) < 2:
-        return np.empty((0, 2)), np.empty((0, 2))
-    nearest = cv2.BFMatcher().knnMatch(first.descriptors, second.descriptors, k=2)
-    good = [best for best, next_best in nearest if best.distance < _LOWE_RATIO * next_best.distance]
-    rows = np.array([(match.queryIdx, match.trainIdx) for match in good], dtype=np.int64).reshape(-1, 2)
-    return first.rays[rows[:, 0]], second.rays[rows[:, 1]]
+def apart_of(matches: Matches, world_from_cam: Floats) -> tuple[Floats, Floats]:
+    """How far the pictures of each pair are apart, in the capture's unit and in degrees, (P,) each."""
+    first, second = world_from_cam[matches.pairs.T]
+    turn_deg = rotation_error_deg(*(quaternion_from_matrix(each[:, :3, :3]) for each in (first, second)))
+    return np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1), turn_deg
+
+
+def _round_edges(values: Floats) -> list[float]:
+    """Edges 1, 2, 5, 10, ... around some lengths, so many at most: the first and last bin hold what is left."""
+    steps = np.array([digit * 10.0**power for power in range(-9, 10) for digit in (1, 2, 5)])
+    low, high = np.quantile(values, (0.02, 0.98))
+    inner = steps[(steps > low) & (steps < high)][-(_MOST_BINS - 1) :]
+    return [0.0, *inner.tolist(), float("inf")]
+
+
+def _fitted(matches: Matches, pair: int) -> int:
+    """How many matches of a pair agree with the pose that most of them agree with."""
+    rows = slice(*np.searchsorted(matches.pair, (pair, pair + 1)))
+    near = NEAR_PX / matches.focal_px[pair]
+    first, second = matches.first[rows], matches.second[rows]
+    _, inliers = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, near, 300)
+    return 0 if inliers is None else int(np.count_nonzero(inliers))
+
+
+def _in_front(second_from_first: Floats, first: Floats, second: Floats, near: Floats) -> NDArray[np.bool_]:
+    """Whether rays pass closest in front of both cameras, (M,); true where they are parallel to a pixel."""
+    ones = np.ones((len(first), 1))
+    turned = (second_from_first[:, :3, :3] @ np.hstack((first, ones))[..., None])[..., 0]
+    end, shift = np.hstack((second, ones)), second_from_first[:, :3, 3]
+    between = np.cross(turned, end)
+    depth_second = (between * np.cross(turned, shift)).sum(axis=1)
+    depth_first = (between * np.cross(end, shift)).sum(axis=1)
+    sine = np.linalg.norm(between, axis=1) / (np.linalg.norm(turned, axis=1) * np.linalg.norm(end, axis=1))
+    return (sine <= near) | ((depth_second > 0) & (depth_first > 0))

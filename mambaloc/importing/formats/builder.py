@@ -14,7 +14,7 @@ from mambaloc.data.datasets.capture import MOST_FRAMES
 from mambaloc.data.frames import ROTATION_TOLERANCE, UNIT_TOLERANCE
 from mambaloc.errors import InputError
 from mambaloc.images import LARGEST_SIDE_PX
-from mambaloc.importing.capture import Camera, Capture, Unit
+from mambaloc.importing.capture import Camera, Capture, Depth, Unit
 from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quaternion_from_matrix
 
 Matrices = NDArray[np.float64]
@@ -32,6 +32,7 @@ class Posed:
     camera: str | None = None
     time_s: float | None = None
     split: str | None = None
+    depth: Path | None = None
 
 
 def build_capture(
@@ -44,6 +45,7 @@ def build_capture(
     cameras: Mapping[str, Camera] | None = None,
     missing: Sequence[str] = (),
     beside: Iterable[Path] = (),
+    depth_camera: Matrices | None = None,
 ) -> Capture:
     """Make a capture: sequence after sequence, in the order of their first images.
 
@@ -56,6 +58,7 @@ def build_capture(
         cameras: by name.
         missing: images that the format names and that are not there.
         beside: images that are there, of which some may be among ``posed``.
+        depth_camera: (3, 3), in pixels of depth frames, which are in millimetres.
 
     Raises:
         InputError: for no image, one with two poses, or more than a scene may have.
@@ -88,6 +91,7 @@ def build_capture(
         split=tuple(splits) if len(splits) == len(ordered) and set(splits) != {"unused"} else None,
         poses_without_image=tuple(missing),
         images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in used),
+        depth=None if depth_camera is None else Depth(tuple(each.depth for each in ordered), depth_camera),
     )
 
 

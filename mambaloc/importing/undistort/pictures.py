@@ -77,6 +77,7 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
     def of(values: tuple[str, ...] | None) -> tuple[str, ...] | None:
         return None if values is None else tuple(values[row] for row in rows)
 
+    depth = capture.depth
     return replace(
         capture,
         images=tuple(capture.images[row] for row in rows),
@@ -85,6 +86,7 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
         camera_of=of(capture.camera_of),
         time_s=None if capture.time_s is None else capture.time_s[np.array(rows, dtype=np.int64)],
         split=of(capture.split),
+        depth=depth and replace(depth, files=tuple(depth.files[row] for row in rows)),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from mambaloc.runtime.maps.features import (
 )
 from mambaloc.runtime.maps.sparse_map import SparseMap
 from mambaloc.runtime.maps.viewpoints import spread_m, viewpoints
-from mambaloc.runtime.rotations import quaternion_from_matrix
+from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.floating[Any]]
 
@@ -37,6 +37,8 @@ _WINDOWS = (6.0, 2.0)  # radii of the guided rounds, in times of what is near
 _PRIOR_WINDOW = 12.0  # likewise, around a prior: 54 px at a width of 160
 _LEAST_SHARE = 0.1
 _MOST_DEVIATION = 0.04  # of the key frames' spread; wrong poses rest on few matches, or on matches in one corner
+_CONFIRMED_INLIERS, _CONFIRMED_DEVIATION = 8, 0.06
+_CONFIRMED_MOVE, _CONFIRMED_TURN_DEG = 0.5, 15.0  # of the key frames' spread: a wrong pose is rarely that near a prior
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,8 @@ class MapLocalisation:
         covariance: of the position in metres, then of the rotation in radians about the fixed axes of the world: the
             order and frame of ROS's PoseWithCovariance. It says how well the matches fix the pose; errors that the
             map's own poses share are not in it.
+        is_confirmed: whether a prior is near a pose that is not accepted: within half of the key frames' spread and 15
+            degrees of one that 8 matches or more fix to 6 % of the spread.
     """
 
     position_m: Floats
@@ -63,6 +67,7 @@ class MapLocalisation:
     inliers: int
     is_accepted: bool
     covariance: Floats
+    is_confirmed: bool = False
 
 
 class MapLocaliser:
@@ -125,7 +130,17 @@ class MapLocaliser:
             return found
         keypoints, points = self._search(features, self.drift.to_adjusted(prior), _PRIOR_WINDOW * near)
         start = ransac_pose(self._points_m[points], features.rays[keypoints], near, rng)
-        return max(found, self._settled(features, start, near), key=lambda each: (each.is_accepted, each.inliers))
+        both = [self._confirmed(each, prior) for each in (found, self._settled(features, start, near))]
+        return max(both, key=lambda each: (each.is_accepted, each.is_confirmed, each.inliers))
+
+    def _confirmed(self, found: MapLocalisation, prior: CameraPose) -> MapLocalisation:
+        move = np.linalg.norm(found.position_m - prior.position_m) / self._unit_m
+        turn_deg = rotation_error_deg(found.quaternion, quaternion_from_matrix(prior.rotation))
+        is_near = move <= _CONFIRMED_MOVE and turn_deg <= _CONFIRMED_TURN_DEG
+        is_fixed = found.inliers >= _CONFIRMED_INLIERS and _deviation_m(found.covariance) <= (
+            _CONFIRMED_DEVIATION * self._unit_m
+        )
+        return replace(found, is_confirmed=bool(is_near and is_fixed))
 
     def _settled(self, features: Features, start: CameraPose | None, near: float) -> MapLocalisation:
         """Search around a pose and refine it, twice."""
@@ -141,8 +156,8 @@ class MapLocaliser:
             off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
             scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
         inliers = int((off <= near).sum())
-        deviation_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])  # in the direction that is least sure
-        is_accepted = inliers >= self.map.least_inliers and bool(deviation_m <= _MOST_DEVIATION * self._unit_m)
+        is_fixed = _deviation_m(covariance) <= _MOST_DEVIATION * self._unit_m
+        is_accepted = inliers >= self.map.least_inliers and bool(is_fixed)
         pose, unsure = self.drift.to_given(pose)
         covariance = covariance + unsure
         return MapLocalisation(pose.position_m, quaternion_from_matrix(pose.rotation), inliers, is_accepted, covariance)
@@ -202,6 +217,11 @@ def near_px(width: int) -> float:
     Poses of a real capture drift by that much; where matches agree better, the refinement follows them.
     """
     return 4.5 * width / 160
+
+
+def _deviation_m(covariance: Floats) -> float:
+    """Of the position, in the direction that is least sure."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
 
 
 def _nowhere() -> MapLocalisation:

@@ -7,16 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import FLIP, capture_of, line, poses_at
+from captures import capture_of, line, poses_at
 from scipy.spatial.transform import Rotation
 
 from mambaloc.importing.checks import sanity
-from mambaloc.importing.checks.conventions import check_agreement, check_axes, check_up, up_of
-from mambaloc.importing.checks.epipolar import AS_READ, CONVENTIONS, Agreement, agreement, agrees
+from mambaloc.importing.checks.conventions import check_axes, check_up, up_of
 from mambaloc.importing.checks.findings import Finding, verdict_of
 from mambaloc.importing.motion import motion_of
-from mambaloc.importing.registry import read_capture
-from mambaloc.importing.undistort.pictures import write_pictures
 
 
 def circle(count=60, radius=2.0, inwards=True, turns=1.0):
@@ -93,69 +90,6 @@ def test_where_optical_axes_meet(inwards, said):
 
 def test_parallel_axes_meet_nowhere():
     assert check_axes(capture_of(poses_at(line(30)))).said == "parallel"
-
-
-# --- images and poses ------------------------------------------------------------------------------------------------
-
-
-def test_matches_of_known_points_agree_and_others_do_not():
-    rng = np.random.default_rng(1)
-    first_from_second = np.eye(4)
-    first_from_second[:3, :3] = Rotation.from_euler("xyz", (3, 8, -2), degrees=True).as_matrix()
-    first_from_second[:3, 3] = (0.3, -0.1, 0.05)
-    points = rng.uniform((-1, -1, 2), (1, 1, 5), (300, 3))
-    second_from_first = np.linalg.inv(first_from_second)
-    seen = points @ second_from_first[:3, :3].T + second_from_first[:3, 3]
-    first, second = (each[:, :2] / each[:, 2:] for each in (points, seen))
-    assert agrees(second_from_first, first, second, 1e-6).all()
-    assert agrees(second_from_first, first, rng.permutation(second), 1e-3).mean() < 0.05
-    backwards = second_from_first.copy()
-    backwards[:3, 3] *= -1  # the same lines, and all points behind the cameras
-    assert not agrees(backwards, first, second, 1e-6).any()
-
-
-@pytest.fixture(scope="module")
-def written(rendered_once, tmp_path_factory):
-    return write_pictures(read_capture(rendered_once.folder), tmp_path_factory.mktemp("written"))[0]
-
-
-MEANT = {
-    AS_READ: lambda pose: pose,
-    "world to camera": np.linalg.inv,
-    "camera to world in OpenGL's axes": lambda pose: pose @ FLIP,
-    "world to camera in OpenGL's axes": lambda pose: np.linalg.inv(pose @ FLIP),
-}
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_pictures_tell_in_which_convention_poses_are(written, convention):
-    poses = np.stack([MEANT[convention](pose) for pose in written.world_from_cam])
-    capture = replace(written, world_from_cam=poses)
-    found = agreement(capture, motion_of(capture))
-    assert found.best == convention
-    assert found.share[convention] > 0.6
-    assert max(share for name, share in found.share.items() if name != convention) < 0.4
-    finding = check_agreement(found)
-    assert (f"look like {convention}" in finding.concern) == (convention != AS_READ)
-
-
-def test_pictures_of_other_poses_agree_with_none(written):
-    capture = replace(written, images=written.images[20:] + written.images[:20])
-    finding = check_agreement(agreement(capture, motion_of(capture)))
-    assert "agree with the poses: these may be inaccurate" in finding.concern
-
-
-def test_pictures_without_camera_are_compared_with_a_guess(written):
-    capture = replace(written, cameras={}, camera_of=None)
-    finding = check_agreement(agreement(capture, motion_of(capture)))
-    assert "focal length guessed" in finding.said
-    assert not finding.concern
-
-
-def test_too_few_matches_are_no_evidence():
-    finding = check_agreement(Agreement(dict.fromkeys(CONVENTIONS, 0.0), 12, 3, False))
-    assert finding.said == "not compared: 12 matches on 3 pairs of images"
-    assert not finding.concern
 
 
 # --- steps, duplicates, times ----------------------------------------------------------------------------------------

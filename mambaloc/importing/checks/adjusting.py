@@ -1,0 +1,121 @@
+"""Poses of a capture adjusted to its pictures by bundle adjustment: an offer beside those given, not a replacement."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.importing.capture import Capture, Depth
+from mambaloc.importing.checks.depth import sampled
+from mambaloc.importing.checks.matching import searched, shown
+from mambaloc.mapping.adjusting import moves
+from mambaloc.mapping.pairs import pairs_by_pose
+from mambaloc.mapping.structure import recover_structure
+from mambaloc.mapping.tracks import match
+from mambaloc.runtime.maps.features import Features
+from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
+
+Floats = NDArray[np.floating[Any]]
+Indices = NDArray[np.int64]
+
+_MOST_FRAMES = 100  # the others move with their neighbours
+_LEAST_POINTS = 50
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Adjusted poses, and how they were found.
+
+    Args:
+        world_from_cam: (N, 4, 4), a frame each.
+        frames: that were adjusted; the others move with their neighbours.
+        points: that these see.
+        moved: how far camera centres moved, in the capture's unit, median.
+        turned_deg: how far cameras turned, median.
+        turns: length of the turns between neighbours over that before.
+        with_depth: whether depth held the scale and the turns.
+    """
+
+    world_from_cam: Floats
+    frames: int
+    points: int
+    moved: float
+    turned_deg: float
+    turns: float
+    with_depth: bool
+
+
+def adjust_poses(capture: Capture) -> Adjusted:
+    """Adjust poses to what the pictures show, with the given ones and depth, where there is some, as priors.
+
+    Args:
+        capture: its images are those of pinholes.
+
+    Raises:
+        InputError: where its pictures give too few points.
+    """
+    every, stride = np.arange(len(capture.images)), -(-len(capture.images) // _MOST_FRAMES)
+    rows = every[::stride]
+    given = capture.world_from_cam[rows]
+    pairs = pairs_by_pose(given)
+    if not len(pairs):
+        raise InputError(
+            "--adjust-poses: no two frames look the same way from apart. Film while walking, or leave it out."
+        )
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = pool.map(lambda row: searched(capture, row), rows.tolist())
+        features = list(shown(found, "Finding keypoints", len(rows)))
+        of_pairs = pool.map(lambda pair: match(features[pair[0]], features[pair[1]]), pairs.tolist())
+        matches = list(shown(of_pairs, "Matching pictures", len(pairs)))
+    depth = None
+    if capture.depth is not None:
+        depth = [_depth(capture.depth, row, each) for row, each in zip(rows.tolist(), features, strict=True)]
+    structure = recover_structure(features, given, pairs, matches, np.random.default_rng(0), depth)
+    if len(structure.points_m) < _LEAST_POINTS:
+        raise InputError(
+            f"--adjust-poses: the pictures give {len(structure.points_m)} points. Film more texture, or leave it out."
+        )
+    after = structure.world_from_cam
+    quaternion = (quaternion_from_matrix(each[:, :3, :3]) for each in (given, after))
+    return Adjusted(
+        _carried(capture, rows, after),
+        len(rows),
+        len(structure.points_m),
+        float(np.median(np.linalg.norm(after[:, :3, 3] - given[:, :3, 3], axis=1))),
+        float(np.median(rotation_error_deg(*quaternion))),
+        _turns(after) / max(_turns(given), 1e-12),
+        depth is not None,
+    )
+
+
+def _depth(depth: Depth, row: int, features: Features) -> Floats:
+    file = depth.files[row]
+    return np.full(len(features), np.nan) if file is None else sampled(depth, file, features.rays)
+
+
+def _carried(capture: Capture, rows: Indices, adjusted: Floats) -> Floats:
+    """Move and turn every frame as the adjusted frames around it were, interpolated within its sequence."""
+    found, names = capture.world_from_cam.copy(), np.array(capture.sequences)
+    changes = moves(found[rows], adjusted)
+    for name in dict.fromkeys(capture.sequences):
+        every = np.flatnonzero(names == name)
+        here = np.flatnonzero(names[rows] == name)
+        if not len(here):
+            continue
+        change = np.column_stack([np.interp(every, rows[here], column) for column in changes[here].T])
+        found[every, :3, 3] += change[:, :3]
+        found[every, :3, :3] = np.array([cv2.Rodrigues(turn)[0] for turn in change[:, 3:]]) @ found[every, :3, :3]
+    return found
+
+
+def _turns(poses: Floats) -> float:
+    """Sum of the turns from frame to frame."""
+    between = poses[1:, :3, :3] @ poses[:-1, :3, :3].swapaxes(1, 2)
+    return float(sum(np.linalg.norm(cv2.Rodrigues(turn)[0]) for turn in between))

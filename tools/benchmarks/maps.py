@@ -1,0 +1,65 @@
+"""Compare a network, a sparse map, and both together under disturbances; and our map with pycolmap's own route.
+
+python tools/benchmarks/maps.py robustness RECIPE|SCENE [--checkpoint CHECKPOINT] [--frames N] [--width PX]
+python tools/benchmarks/maps.py colmap RECIPE|SCENE [--frames N] [--width PX]
+python tools/benchmarks/maps.py report FOLDER ... --out PICTURE
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from maps_report import by_disturbance, draw, overview, read_results
+
+from mambaloc.console import exits_cleanly, quieten, whole_number
+from mambaloc.mapping.recipe import MapRecipe, read_recipe
+
+
+@exits_cleanly
+def main() -> None:
+    """Measure, print and write."""
+    quieten()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    robustness, colmap, report = (commands.add_parser(name) for name in ("robustness", "colmap", "report"))
+    for command in (robustness, colmap):
+        command.add_argument("source", type=Path, metavar="RECIPE|SCENE", help="as tools/map.py takes it")
+        command.add_argument("--frames", type=whole_number(2), help="key frames; the recipe's unless given")
+        command.add_argument(
+            "--width", type=whole_number(32), help="of the pictures in which keypoints are searched, in pixels"
+        )
+        command.add_argument("--seeds", type=whole_number(0), nargs="+", help="of RANSAC; the recipe's unless given")
+        command.add_argument(
+            "--hold-out", metavar="SEQUENCE", help="of the training frames: measure on it, not on test"
+        )
+        command.add_argument("--out", type=Path, help="folder to write to")
+    robustness.add_argument("--checkpoint", type=Path, help="of a network trained on the same scene")
+    robustness.add_argument("--training-cpu-s", type=float, help="CPU seconds that its training took, for the tables")
+    robustness.add_argument("--unit", default="m", help="of the scene's positions, for the figure")
+    report.add_argument("folders", nargs="+", type=Path, help="that robustness wrote")
+    report.add_argument("--out", type=Path, required=True, help="picture to draw, a PNG")
+    args = parser.parse_args()
+    if args.command == "report":
+        results = read_results(args.folders)
+        draw(results, args.out)
+        print(overview(results), *map(by_disturbance, results), sep="\n")
+        return
+    recipe = MapRecipe(str(args.source)) if args.source.is_dir() else read_recipe(args.source)
+    given = {"key_frames": args.frames, "width": args.width}
+    settings = replace(recipe.settings, **{key: value for key, value in given.items() if value is not None})
+    recipe = replace(recipe, settings=settings, ransac_seeds=tuple(args.seeds or recipe.ransac_seeds))
+    out = args.out or Path("runs", args.command, f"{args.source.resolve().stem}_{settings.key_frames}")
+    if args.command == "robustness":
+        from maps_scenes import measure_robustness
+
+        print(measure_robustness(recipe, args.checkpoint, args.training_cpu_s, args.hold_out, args.unit, out))
+    else:
+        from maps_beside import measure_beside_colmap
+
+        print(measure_beside_colmap(recipe, args.hold_out, out))
+
+
+if __name__ == "__main__":
+    main()
