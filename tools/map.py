@@ -1,4 +1,9 @@
-"""Build a sparse map and measure it: python tools/map.py RECIPE.yaml|SCENE [--frames N] [--width PX] [--out FOLDER]."""
+"""Build a sparse map and measure it; or grow one by new frames, and take them out again.
+
+python tools/map.py RECIPE.yaml|SCENE [--frames N] [--width PX] [--out FOLDER]
+python tools/map.py MAP --add FRAMES --out FOLDER [--name NAME] [--test RECIPE.yaml|SCENE]
+python tools/map.py MAP --remove NAME --out FOLDER
+"""
 
 import os
 
@@ -10,29 +15,90 @@ from pathlib import Path
 
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.errors import InputError
-from mambaloc.mapping.evaluating import build_and_measure, describe
-from mambaloc.mapping.recipe import MapRecipe, read_recipe
+from mambaloc.mapping.evaluating import build_and_measure, describe, measure, read_frames
+from mambaloc.mapping.growing import add_frames, remove_session
+from mambaloc.mapping.new_frames import parse_intrinsics, read_new_frames
+from mambaloc.mapping.recipe import recipe_of
+from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
+from mambaloc.viz.coverage import write_coverage
+from mambaloc.viz.matches import write_points
 
 
 @exits_cleanly
 def main(argv: list[str] | None = None) -> None:
-    """Build from training frames, measure on test frames, write map.safetensors and metrics.json."""
+    """Write map.safetensors, coverage.png, and what the map does on test frames."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("source", type=Path, metavar="RECIPE|SCENE", help="a YAML file, or an imported scene's folder")
-    parser.add_argument("--frames", type=int, help="key frames, of the training frames; the recipe's unless given")
-    parser.add_argument("--width", type=int, help="of the pictures in which keypoints are searched, in pixels")
-    parser.add_argument("--out", type=Path, help="folder to write to; runs/NAME unless given")
-    args = parser.parse_args(argv)
-    recipe = MapRecipe(str(args.source)) if args.source.is_dir() else read_recipe(args.source)
+    args = _parser().parse_args(argv)
     for option, least, value in (("frames", 2, args.frames), ("width", 32, args.width)):
         if value is not None and value < least:
             raise InputError(f"--{option} {value}: is less than {least}. Give more.")
+    if args.source.suffix == Path(MAP_FILE).suffix or (args.source / MAP_FILE).is_file():
+        _change(args)
+    else:
+        _build(args)
+
+
+def _build(args: argparse.Namespace) -> None:
+    if args.add or args.remove or args.test:
+        raise InputError(f"{args.source}: is not a map, so nothing can be added, removed or tested. Build it first.")
+    recipe = recipe_of(args.source)
     given = {"key_frames": args.frames, "width": args.width}
     settings = replace(recipe.settings, **{key: value for key, value in given.items() if value is not None})
     out = args.out or Path("runs", args.source.resolve().stem)
     result = build_and_measure(replace(recipe, settings=settings), out)
-    print(f"{out}: map.safetensors, metrics.json", describe(result), sep="\n")
+    sparse_map = SparseMap.load(out / MAP_FILE)
+    print(f"{out}: {MAP_FILE}, metrics.json, coverage.png, points.png")
+    print(write_coverage(sparse_map, out / "coverage.png"))
+    write_points({"map": sparse_map}, read_frames(recipe, "test"), out / "points.png", sparse_map.scene)
+    print(describe(result))
+
+
+def _change(args: argparse.Namespace) -> None:
+    path = args.source / MAP_FILE if args.source.is_dir() else args.source
+    before = after = SparseMap.load(path)
+    if (args.add or args.remove) and args.out is None:
+        raise InputError(f"{path}: is not overwritten unasked. Give --out FOLDER, which may be {path.parent}.")
+    out = args.out or path.parent
+    if args.add:
+        frames = read_new_frames(args.add, MapLocaliser(before), args.intrinsics)
+        growth = add_frames(before, frames, args.name or args.add.stem, args.frames or 160)
+        after = growth.sparse_map
+        print(growth.describe(len(before)))
+    elif args.remove:
+        after = remove_session(before, args.remove)
+        print(f"{len(before) - len(after)} points removed; {len(after)} are left")
+    if after is not before:
+        after.save(out / MAP_FILE)
+    print(f"{out}: coverage.png", write_coverage(after, out / "coverage.png"), sep="\n")
+    if args.test:
+        recipe = recipe_of(args.test)
+        test = read_frames(recipe, "test")
+        maps = {"before": before, "after": after} if after is not before else {"map": before}
+        write_points(maps, test, out / "points.png", after.scene)
+        for name, each in maps.items():
+            print(f"{name}: {measure(each, test, recipe.ransac_seeds).describe()}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    lines = (__doc__ or "").splitlines()
+    parser = argparse.ArgumentParser(description=lines[0], epilog=" ".join(lines[2:]))
+    parser.add_argument(
+        "source", type=Path, metavar="RECIPE|SCENE|MAP", help="a YAML file, an imported scene's folder, or a map"
+    )
+    parser.add_argument("--frames", type=int, help="key frames, of the training frames or of those added; 160")
+    parser.add_argument("--width", type=int, help="of the pictures in which keypoints are searched, in pixels")
+    parser.add_argument("--out", type=Path, help="folder to write to; a new map's is runs/NAME unless given")
+    change = parser.add_mutually_exclusive_group()
+    change.add_argument(
+        "--add", type=Path, metavar="FRAMES", help="a scene or recipe with poses, a folder of pictures, or a film"
+    )
+    change.add_argument("--remove", metavar="NAME", help="what was added under this name")
+    parser.add_argument("--name", help="of what is added, by which it may be removed; that of FRAMES unless given")
+    parser.add_argument(
+        "--intrinsics", type=parse_intrinsics, metavar="FX,FY,CX,CY", help="of pictures to add; the map's unless given"
+    )
+    parser.add_argument("--test", type=Path, metavar="RECIPE|SCENE", help="measure the map on its test frames")
+    return parser
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from pathlib import Path
 import lightning as L
 
 from mambaloc.models import LitPoseRegressor
-from mambaloc.viz import draw_trajectory
+from mambaloc.viz.trajectory import draw_trajectory
 
 
 class TrajectoryPlot(L.Callback):

@@ -16,7 +16,7 @@ from mambaloc.evaluation.predict import localise_test_frames
 from mambaloc.evaluation.trained import Trained
 from mambaloc.metrics import PoseErrorTable, summarise
 from mambaloc.viz.curves import Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
-from mambaloc.viz.trajectory import write_png
+from mambaloc.viz.png import write_png
 
 _ERRORS = {"position_error_m": "position error (m)", "rotation_error_deg": "rotation error (°)"}
 

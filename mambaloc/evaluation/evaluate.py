@@ -25,7 +25,7 @@ from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.models.weights import mib, parameter_count
 from mambaloc.nn import PooledBackbone
 from mambaloc.runtime.trajectory import write_tum
-from mambaloc.viz import draw_trajectory
+from mambaloc.viz.trajectory import draw_trajectory
 
 
 def evaluate_checkpoint(

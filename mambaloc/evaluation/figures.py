@@ -16,17 +16,11 @@ from mambaloc.evaluation.trained import Trained
 from mambaloc.files import writing
 from mambaloc.geometry import position_error_m, rotation_error_deg
 from mambaloc.types import PoseBatch
-from mambaloc.viz import (
-    BranchHeat,
-    draw_features,
-    draw_heat_maps,
-    draw_top_view,
-    draw_trajectory,
-    heat_maps,
-    position_features,
-    principal_colors,
-    write_scene_page,
-)
+from mambaloc.viz.features import draw_features, position_features, principal_colors
+from mambaloc.viz.heatmaps import BranchHeat, draw_heat_maps, heat_maps
+from mambaloc.viz.scene_page import write_scene_page
+from mambaloc.viz.top_view import draw_top_view
+from mambaloc.viz.trajectory import draw_trajectory
 
 MOST_FRAMES = 12
 """Frames side by side in one figure."""

@@ -16,7 +16,8 @@ from mambaloc.importing.checks.depth import SCALES
 from mambaloc.importing.checks.epipolar import FOCALS, NEAR_PX, Bin
 from mambaloc.importing.motion import motion_of
 from mambaloc.importing.splits.selection import RULE, Proposal
-from mambaloc.viz import draw_agreement, draw_capture
+from mambaloc.viz.agreement import draw_agreement
+from mambaloc.viz.capture import draw_capture
 
 REPORT_FILE, PLOT_FILE, AGREEMENT_FILE = "report.md", "trajectory.png", "agreement.png"
 _IN_TERMINAL = (

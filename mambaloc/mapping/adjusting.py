@@ -62,6 +62,7 @@ def adjust(
     sigma: float,
     is_lens_free: bool,
     depth_m: Floats | None = None,
+    is_fixed: NDArray[np.bool_] | None = None,
 ) -> Bundle:
     """Move cameras, points and the lens to where points project to what is seen, with Cauchy's weights.
 
@@ -73,9 +74,12 @@ def adjust(
         sigma: an observation that is off by so much, in the plane at depth 1, has half the weight.
         is_lens_free: whether the lens is adjusted.
         depth_m: measured along the optical axis, of each observation (O,); NaN where it was not.
+        is_fixed: points that stay where they are, (T,); none unless given.
     """
     depth_m = np.full(len(seen), np.nan) if depth_m is None else depth_m
     problem = _Problem(given, drift, seen, sigma, is_lens_free, depth_m)
+    if is_fixed is not None:
+        problem.is_fixed = is_fixed[seen.track]
     now, cost, damping = start, problem.cost(start), _DAMPING
     for _ in range(_STEPS):
         equations = problem.linearized(now)
@@ -111,6 +115,7 @@ class _Problem:
         depth_m: Floats,
     ) -> None:
         self.given, self.seen, self.sigma = given, seen, sigma
+        self.is_fixed = np.zeros(len(seen), bool)
         self.is_measured = np.isfinite(depth_m)
         self.depth_m = np.where(self.is_measured, depth_m, np.inf)[:, None]  # infinite, so that it weighs nothing
         self.least_depth = _LEAST_DEPTH * spread_m(given)
@@ -152,6 +157,7 @@ class _Problem:
         # A turn by θ about the world's axes moves a point, as the camera sees it, by -θ x towards.
         by_camera = np.concatenate((-by_point, by_point @ _cross(towards)), axis=-1)
         by_camera, by_lens, by_point = (weight * each for each in (by_camera, by_lens, by_point))
+        by_point[self.is_fixed] = 0
         return _Equations(self, by_camera, by_lens, by_point, weight * off[..., None], self.moves(at))
 
 

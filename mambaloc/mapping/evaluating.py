@@ -57,6 +57,14 @@ class MapErrors:
             "query_cpu_ms": float(1000 * self.cpu_s.mean()),
         }
 
+    def describe(self) -> str:
+        """In one line."""
+        summary = self.summary()
+        return (
+            f"median {summary['position_error_m']:.3f} m / {summary['rotation_error_deg']:.2f} deg, "
+            f"{100 * summary['recall_10cm_5deg']:.1f} % within 10 cm 5 deg, {100 * summary['accepted']:.1f} % accepted"
+        )
+
 
 def read_frames(recipe: MapRecipe, split: Split) -> PosedFrames:
     """Read a split of a recipe's scene with its cameras.

@@ -63,5 +63,10 @@ def read_recipe(path: Path) -> MapRecipe:
     return MapRecipe(**texts, settings=settings, ransac_seeds=tuple(data.get("ransac_seeds", (0, 1, 2))))
 
 
+def recipe_of(source: Path) -> MapRecipe:
+    """The recipe that a file holds, or that an imported scene's folder stands for; errors are :func:`read_recipe`'s."""
+    return MapRecipe(str(source)) if source.is_dir() else read_recipe(source)
+
+
 def _is_int(value: object, least: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= least

@@ -24,8 +24,8 @@ Indices = NDArray[np.int64]
 _NEAR_PX = (4.0, 2.0)
 _SIGMA_PX = 0.5
 # How far given poses may drift: at first by 3 cm in a room that is filmed from its middle, then by what was found.
-_DRIFT = 0.05  # of the cameras' spread
-_DRIFT_RAD = np.radians(1.0)
+DRIFT = 0.05  # of the cameras' spread
+DRIFT_RAD = np.radians(1.0)
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,10 @@ def recover_structure(
     focal_px = features[0].intrinsics[0, 0]
     is_one_camera = all(np.allclose(each.intrinsics, features[0].intrinsics) for each in features)
     poses, lens, share = given, Lens(), np.nan
-    drift = (_DRIFT * spread_m(given), _DRIFT_RAD)
+    drift = (DRIFT * spread_m(given), DRIFT_RAD)
     for near_px in _NEAR_PX:
         is_first = near_px == _NEAR_PX[0]
-        points, seen, keypoint, kept = _triangulated(features, poses, pairs, matches, near_px * unit_px, rng)
+        points, seen, keypoint, kept = triangulated(features, poses, pairs, matches, near_px * unit_px, rng)
         share = kept / max(sum(len(each) for each in matches), 1) if is_first else share
         if not len(points):
             break
@@ -86,15 +86,22 @@ def recover_structure(
         if is_first:
             lens = bundle.lens
             features = [lens.straighten(each) for each in features]
-    points, seen, keypoint, _ = _triangulated(features, poses, pairs, matches, _NEAR_PX[-1] * unit_px, rng)
-    mean = np.zeros((len(points), features[0].descriptors.shape[1]), np.float32)
+    points, seen, keypoint, _ = triangulated(features, poses, pairs, matches, _NEAR_PX[-1] * unit_px, rng)
+    return Structure(poses, lens, points, *mean_descriptors(features, len(points), seen, keypoint), share)
+
+
+def mean_descriptors(
+    features: Sequence[Features], points: int, seen: Observations, keypoint: Indices
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Descriptors of points, (P, 128), means of unit length, and which frames see each, (P, N)."""
+    mean = np.zeros((points, features[0].descriptors.shape[1]), np.float32)
     np.add.at(mean, seen.track, np.concatenate([each.descriptors for each in features])[keypoint])
-    views = np.zeros((len(points), len(features)), bool)
+    views = np.zeros((points, len(features)), bool)
     views[seen.track, seen.frame] = True
-    return Structure(poses, lens, points, mean / np.linalg.norm(mean, axis=1, keepdims=True), views, share)
+    return mean / np.linalg.norm(mean, axis=1, keepdims=True), views
 
 
-def _triangulated(
+def triangulated(
     features: Sequence[Features],
     world_from_cam: Floats,
     pairs: Indices,
@@ -132,7 +139,8 @@ def _tracks(
 ) -> tuple[Observations, Indices]:
     """Keypoints that matches connect, and which each is, of all frames' laid end to end (O,)."""
     first = np.cumsum([0, *(len(each) for each in features)])
-    edges = np.concatenate([rows + first[pair] for pair, rows in zip(pairs, matches, strict=True)])
+    linked = [rows + first[pair] for pair, rows in zip(pairs, matches, strict=True)]
+    edges = np.concatenate([np.empty((0, 2), np.int64), *linked])
     root = connected(first[-1], edges)
     keypoint = np.unique(edges)
     keypoint = keypoint[np.argsort(root[keypoint], kind="stable")]

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from mambaloc.viz.trajectory import write_png
+from mambaloc.viz.png import write_png
 
 Floats = NDArray[np.floating]
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from mambaloc.viz.trajectory import write_png
+from mambaloc.viz.png import write_png
 
 COLORS = {"test": "#d73027", "val": "#f39c12", "train": "#2166ac", "unused": "#b0b0b0"}
 _JUMP_COLOR = "#8e44ad"
@@ -49,7 +49,7 @@ def draw_capture(
         title: heads the plot.
         unit: of positions.
     """
-    axes, names = _plot_axes(position, up)
+    axes, names = plot_axes(position, up)
     low, high = (np.array([extreme(position @ axis) for axis in axes]) for extreme in (np.min, np.max))
     side = float((high - low).max()) or 1.0
     low, high = low - _MARGIN * side, high + _MARGIN * side
@@ -73,7 +73,7 @@ def draw_capture(
     write_png(figure, path)
 
 
-def _plot_axes(position: Floats, up: Floats) -> tuple[list[Floats], list[str]]:
+def plot_axes(position: Floats, up: Floats) -> tuple[list[Floats], list[str]]:
     """Directions to plot along, right-handed: two that are level, and up; and what they are called."""
     vertical = int(np.abs(up).argmax())
     if np.abs(up[vertical]) > 1 - 1e-9:

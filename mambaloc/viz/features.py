@@ -16,7 +16,7 @@ from torch import Tensor
 from mambaloc.errors import InputError
 from mambaloc.nn import PoseNetwork, TokenEncoder
 from mambaloc.viz.heatmaps import readings
-from mambaloc.viz.trajectory import write_png
+from mambaloc.viz.png import write_png
 
 _CELL_IN, _COLORS = 2.2, 3
 _PERCENTILES = (0.02, 0.98)

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from mambaloc.errors import InputError
 from mambaloc.geometry import log_from_quaternion
 from mambaloc.nn import Backbone, PoseNetwork
-from mambaloc.viz.trajectory import write_png
+from mambaloc.viz.png import write_png
 
 _CELL_IN = 1.6
 _COLORS = "turbo"

@@ -12,7 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from mambaloc.metrics import PoseErrorTable
-from mambaloc.viz.trajectory import PREDICTED_COLOR, means, medians, write_png
+from mambaloc.viz.png import write_png
+from mambaloc.viz.trajectory import PREDICTED_COLOR, means, medians
 
 _WIDTH_IN, _LEAST_HEIGHT_IN, _MOST_HEIGHT_IN = 7.5, 2.0, 9.0
 

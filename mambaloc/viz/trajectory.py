@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from mambaloc.files import whole_file
 from mambaloc.metrics import PoseErrorTable, summarise
+from mambaloc.viz.png import write_png
 
 TRUE_COLOR, PREDICTED_COLOR = "#1a9850", "#d73027"
 _FAINT_COLOR = "#9e9e9e"
@@ -91,9 +90,3 @@ def means(table: PoseErrorTable) -> str:
     """Say a split's mean errors."""
     summary = summarise(table)
     return f"mean {summary['position_error_mean_m']:.3f} m, {summary['rotation_error_mean_deg']:.2f}°"
-
-
-def write_png(figure: Figure, path: Path) -> None:
-    """Write a figure, cut to what is on it, beside its place, and move it there whole."""
-    with whole_file(path) as partial:
-        FigureCanvasAgg(figure).print_figure(partial, format="png", dpi=140, bbox_inches="tight", pad_inches=0.1)

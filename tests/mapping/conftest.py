@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mambaloc.mapping import PosedFrames
+from mambaloc.mapping import MapSettings, PosedFrames, build_map
 from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render, sensor
 
 SIZE = (160, 120)
@@ -20,13 +20,22 @@ class Walk:
 
 
 def film(count, seed):
+    return shoot(embedded_walk(count, seed, start_deg=45.0 * seed, step_deg=360 / count), seed)
+
+
+def shoot(poses, seed):
     intrinsics, rng = default_intrinsics(SIZE), np.random.default_rng(seed)
-    poses = embedded_walk(count, seed, start_deg=45.0 * seed, step_deg=360 / count)
     room = embedded_room()
     shots = [render(room, intrinsics, pose, SIZE) for pose in poses]
     images = [sensor(picture, rng) for picture, _ in shots]
-    frames = PosedFrames(images, np.repeat(intrinsics[None], count, axis=0), poses)
+    frames = PosedFrames(images, np.repeat(intrinsics[None], len(poses), axis=0), poses)
     return Walk(frames, np.stack([depth for _, depth in shots]))
+
+
+@pytest.fixture(scope="session")
+def film_of():
+    """``film_of(poses, seed)``: frames of the room from poses, (N, 4, 4)."""
+    return shoot
 
 
 @pytest.fixture(scope="session")
@@ -39,3 +48,9 @@ def walk():
 def other_walk():
     """16 frames of another way through the same room."""
     return film(16, seed=2)
+
+
+@pytest.fixture(scope="session")
+def part(walk):
+    """A map of the walk's first half, of which one sees the first half of the room."""
+    return build_map(walk.frames.select(np.arange(0, 40, 2)), MapSettings(key_frames=20, width=160), "room")

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from mambaloc.images import read_image
-from mambaloc.viz.capture import _JUMP_COLOR, COLORS, _plot_axes, draw_capture
+from mambaloc.viz.capture import _JUMP_COLOR, COLORS, draw_capture, plot_axes
 
 UPS = {
     "+x": (1, 0, 0),
@@ -23,7 +23,7 @@ def test_what_is_right_stays_right(name):
     """From above, the second direction is to the left of the first, and the third comes towards the eye."""
     up = np.array(UPS[name], dtype=float)
     position = np.random.default_rng(0).normal(size=(20, 3))
-    axes, labels = _plot_axes(position, up)
+    axes, labels = plot_axes(position, up)
     np.testing.assert_allclose(np.cross(axes[0], axes[1]), axes[2], atol=1e-12)
     np.testing.assert_allclose(axes[2], up)
     for axis, label in zip(axes, labels, strict=True):

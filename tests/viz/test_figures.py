@@ -15,8 +15,8 @@ from mambaloc.errors import InputError
 from mambaloc.evaluation.figures import FIGURES
 from mambaloc.metrics import PoseErrors
 from mambaloc.types import PoseBatch, PosePrediction
-from mambaloc.viz import draw_top_view, write_scene_page
-from mambaloc.viz.top_view import horizontal_axes
+from mambaloc.viz.scene_page import write_scene_page
+from mambaloc.viz.top_view import draw_top_view, horizontal_axes
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

@@ -12,9 +12,8 @@ import mambaloc
 from mambaloc.errors import InputError
 from mambaloc.models.registry import model_class
 from mambaloc.nn import Backbone, PoseHead, PoseNetwork, TokenEncoder
-from mambaloc.viz import heat_maps, position_features, principal_colors
-from mambaloc.viz.features import principal_components
-from mambaloc.viz.heatmaps import Reading, grad_cam, readings
+from mambaloc.viz.features import position_features, principal_colors, principal_components
+from mambaloc.viz.heatmaps import Reading, grad_cam, heat_maps, readings
 
 SMALL = {
     "encoder_layers": 1, "dim": 32, "heads": 4, "feedforward": 32, "head_hidden": 32, "width": 64, "hidden": 16,

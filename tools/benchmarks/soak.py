@@ -28,7 +28,7 @@ from mambaloc.console import exits_cleanly, quieten
 from mambaloc.errors import InputError
 from mambaloc.files import writing
 from mambaloc.viz.curves import COLORS, finish
-from mambaloc.viz.trajectory import write_png
+from mambaloc.viz.png import write_png
 
 _SAMPLES = 200
 _FEWEST = 10  # steps

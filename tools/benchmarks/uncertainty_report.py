@@ -27,7 +27,7 @@ from uncertainty_methods import (
 from mambaloc.benchmark.report import new_table
 from mambaloc.files import whole_file, writing
 from mambaloc.viz.curves import COLORS, finish
-from mambaloc.viz.trajectory import write_png
+from mambaloc.viz.png import write_png
 
 _KEPT = np.linspace(1, 0.1, 46)
 _ERRORS = ("position", "rotation")

@@ -42,6 +42,10 @@ class Features:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    def select(self, rows: NDArray[np.generic]) -> Features:
+        """Some of the keypoints: indices or a mask."""
+        return Features(self.pixels[rows], self.descriptors[rows], self.intrinsics, self.size)
+
     @property
     def rays(self) -> Floats:
         """Where keypoints lie in the plane at depth 1, (N, 2)."""

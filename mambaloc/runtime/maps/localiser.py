@@ -86,11 +86,13 @@ class MapLocaliser:
         self.seed = seed
         self._points_m = sparse_map.points_m.astype(np.float64)
         self._descriptors = dequantized(sparse_map.descriptors)
-        self._views = np.unpackbits(sparse_map.views, axis=1, count=len(sparse_map.key_poses)).view(bool)
+        self._views = sparse_map.is_seen
+        # A map's first points are in this order; those that were added to it are not.
+        self._often = np.argsort(-self._views.sum(axis=1), kind="stable")[:_AT_ONCE]
         self._unit_m = spread_m(sparse_map.key_poses)
         self._viewpoints = viewpoints(sparse_map.key_poses, self._unit_m)
         drift = sparse_map.drift if len(sparse_map.drift) else np.zeros((len(sparse_map.key_poses), 6))
-        self._drift = Drift(sparse_map.key_poses, drift)
+        self.drift = Drift(sparse_map.key_poses[: len(drift)], drift)
 
     def localise(
         self, image: Image, intrinsics: ArrayLike | None = None, prior: CameraPose | None = None
@@ -106,24 +108,27 @@ class MapLocaliser:
             InputError: for another kind of array, intrinsics that do not fit the picture, or none for a picture of
                 another shape than the map's.
         """
+        return self.localise_features(self.features(image, intrinsics), prior)
+
+    def features(self, image: Image, intrinsics: ArrayLike | None = None) -> Features:
+        """Find a picture's keypoints as the map's were found; arguments and errors are those of :meth:`localise`."""
         rgb = as_rgb(image)
         matrix = self._intrinsics(rgb) if intrinsics is None else np.asarray(intrinsics, np.float64)
         check_intrinsics(matrix, (rgb.shape[1], rgb.shape[0]))
         # So that things are as large as in the map's pictures, whatever the lens.
-        return self.localise_features(detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0]), prior)
+        found = detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0])
+        return self.map.lens.straighten(found) if self._is_own_camera(found) else found
 
     def localise_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalisation:
-        """Localise a picture whose keypoints are found already."""
-        if self._is_own_camera(features):
-            features = self.map.lens.straighten(features)
+        """Localise a picture whose keypoints :meth:`features` found."""
         near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
-        best, is_clear = unambiguous(features.descriptors @ self._descriptors[:_AT_ONCE].T, _RATIO)
+        best, is_clear = unambiguous(features.descriptors @ self._descriptors[self._often].T, _RATIO)
         rng = np.random.default_rng(self.seed)
-        start = ransac_pose(self._points_m[best[is_clear]], features.rays[is_clear], near, rng)
+        start = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], near, rng)
         found = self._settled(features, start, near)
         if prior is None or found.is_accepted:
             return found
-        keypoints, points = self._search(features, self._drift.to_adjusted(prior), _PRIOR_WINDOW * near)
+        keypoints, points = self._search(features, self.drift.to_adjusted(prior), _PRIOR_WINDOW * near)
         start = ransac_pose(self._points_m[points], features.rays[keypoints], near, rng)
         both = [self._confirmed(each, prior) for each in (found, self._settled(features, start, near))]
         return max(both, key=lambda each: (each.is_accepted, each.is_confirmed, each.inliers))
@@ -153,9 +158,14 @@ class MapLocaliser:
         inliers = int((off <= near).sum())
         is_fixed = _deviation_m(covariance) <= _MOST_DEVIATION * self._unit_m
         is_accepted = inliers >= self.map.least_inliers and bool(is_fixed)
-        pose, unsure = self._drift.to_given(pose)
+        pose, unsure = self.drift.to_given(pose)
         covariance = covariance + unsure
         return MapLocalisation(pose.position_m, quaternion_from_matrix(pose.rotation), inliers, is_accepted, covariance)
+
+    def matches(self, features: Features, pose: CameraPose) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Points that a picture shows where its pose projects them: rows of keypoints and of points."""
+        near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
+        return self._search(features, pose, near)
 
     def _search(
         self, features: Features, pose: CameraPose, radius: float

@@ -48,7 +48,10 @@ class SparseMap:
         digests: of what the map was made from, by name.
         lens: how the camera differs from ``intrinsics``.
         drift: (K, 6), carries poses to the frame of the given ones, see
-            :func:`~mambaloc.runtime.maps.drift.fit_drift`; (0, 6) where that is the map's own.
+            :func:`~mambaloc.runtime.maps.drift.fit_drift`; (0, 6) where that is the map's own. Key frames that were
+            added later have none.
+        sessions: what was added later: how many key frames each has by its name, in the order of ``key_poses``, whose
+            last they are.
     """
 
     points_m: NDArray[np.float32]
@@ -62,9 +65,15 @@ class SparseMap:
     digests: dict[str, str] = field(default_factory=dict)
     lens: Lens = field(default_factory=Lens)
     drift: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
+    sessions: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.points_m)
+
+    @property
+    def is_seen(self) -> NDArray[np.bool_]:
+        """Which key frames (columns) see which points (rows), (P, K)."""
+        return np.unpackbits(self.views, axis=1, count=len(self.key_poses)).view(bool)
 
     def save(self, path: Path) -> None:
         """Write it to a safetensors file, whole or not at all.
@@ -90,6 +99,7 @@ class SparseMap:
             "scene": self.scene,
             "least_inliers": self.least_inliers,
             "digests": self.digests,
+            "sessions": self.sessions,
             "crc32": _crc32(arrays),
         }
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -137,7 +147,10 @@ class SparseMap:
             raise ValueError(f"{counts} points, descriptors and views")
         if not len(key_poses) or arrays["views"].shape[1] != -(-len(key_poses) // 8):
             raise ValueError(f"{len(key_poses)} key frames in views of {arrays['views'].shape[1]} bytes")
-        if len(arrays["drift"]) not in (0, len(key_poses)):
+        sessions = {str(name): int(count) for name, count in dict(about.get("sessions", {})).items()}
+        if any(count < 1 for count in sessions.values()) or sum(sessions.values()) >= len(key_poses):
+            raise ValueError(f"sessions of {sum(sessions.values())} of {len(key_poses)} key frames")
+        if len(arrays["drift"]) not in (0, len(key_poses) - sum(sessions.values())):
             raise ValueError(f"drift of {len(arrays['drift'])} key frames of {len(key_poses)}")
         if not all(np.isfinite(arrays[name]).all() for name in ("points_m", "key_poses", "lens", "drift")):
             raise ValueError("numbers are not finite")
@@ -148,7 +161,7 @@ class SparseMap:
             points, arrays["descriptors"], arrays["views"], key_poses, (width, height), arrays["intrinsics"],
             int(about["least_inliers"]), str(about["scene"]),
             {str(name): str(digest) for name, digest in dict(about["digests"]).items()},
-            Lens(*map(float, arrays["lens"])), arrays["drift"],
+            Lens(*map(float, arrays["lens"])), arrays["drift"], sessions,
         )  # fmt: skip
 
 

@@ -1,0 +1,209 @@
+"""Grow a sparse map by new frames, and take them out again; what stands in the map does not move."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.mapping.extending import extend
+from mambaloc.mapping.keyframes import farthest_first
+from mambaloc.mapping.tracks import match
+from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.runtime.maps.features import Features, quantized
+from mambaloc.runtime.maps.viewpoints import spread_m
+from mambaloc.runtime.rotations import matrix_from_quaternion
+
+Floats = NDArray[np.floating[Any]]
+
+_MOST_NAMED = 8
+# Times the inliers that an answer needs: a wrong pose that is built on misleads later ones, and a frame that has few of
+# them has more once its neighbours were added.
+_INLIERS = 3
+_FARTHEST, _FARTHEST_DEG = 0.25, 15.0  # of the key frames' spread; by how much a given pose may be off
+
+
+@dataclass(frozen=True)
+class NewFrame:
+    """A frame to add to a map.
+
+    Args:
+        name: of its file, or its number in a film.
+        features: its keypoints, as :meth:`~mambaloc.runtime.maps.MapLocaliser.features` finds them.
+        given: its pose in the map's world, where it is known.
+    """
+
+    name: str
+    features: Features
+    given: CameraPose | None = None
+
+
+@dataclass(frozen=True)
+class Growth:
+    """A map that has grown.
+
+    Args:
+        sparse_map: the map; its first points and key frames are those of the map before, bit for bit.
+        key_frames: names of those that became key frames.
+        lost: names of the frames that were not localised, or whose given pose says otherwise.
+        rounds: how often the frames were localised, each time in the map that those before had made.
+    """
+
+    sparse_map: SparseMap
+    key_frames: list[str]
+    lost: list[str]
+    rounds: int
+
+    def describe(self, points_before: int) -> str:
+        """One line, and one with the names of lost frames where there are any."""
+        text = (
+            f"{len(self.key_frames)} key frames and {len(self.sparse_map) - points_before} points added, "
+            f"in {self.rounds} rounds; {len(self.sparse_map)} points in all"
+        )
+        if self.lost:
+            more = f" and {len(self.lost) - _MOST_NAMED} more" if len(self.lost) > _MOST_NAMED else ""
+            text += f"\nnot found in the map: {len(self.lost)} frames, {', '.join(self.lost[:_MOST_NAMED])}{more}"
+        return text
+
+
+def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, most: int) -> Growth:
+    """Localise frames in a map, make key frames of those found, and triangulate what these add.
+
+    A frame may be found only once its neighbours were added, so that is repeated until nothing more is found. Keypoints
+    that show no point of the map are matched between the new key frames, whose poses are adjusted to all that they see.
+
+    Args:
+        sparse_map: the map.
+        frames: what to add.
+        session: a name by which :func:`remove_session` removes all of it.
+        most: key frames to add; they are spread over the poses found.
+
+    Raises:
+        InputError: for a session that the map has already, where no frame is found, or where all poses contradict
+            those given.
+    """
+    if session in sparse_map.sessions:
+        raise InputError(f"{session}: was added before. Remove that first, or add these under another --name.")
+    matched = functools.cache(lambda first, second: match(frames[first].features, frames[second].features))
+    poses: dict[int, CameraPose] = {}
+    grown, rounds, contradict = sparse_map, 0, 0
+    key: list[int] = []
+    while True:
+        found, contradict = _found(grown, frames, [row for row in range(len(frames)) if row not in poses])
+        rounds += 1
+        if not found:
+            break
+        poses |= found
+        grown, key = _grown(sparse_map, frames, matched, poses, session, most)
+    if not poses:
+        raise InputError(_why_none(session, len(frames), contradict))
+    lost = [frame.name for row, frame in enumerate(frames) if row not in poses]
+    return Growth(grown, [frames[row].name for row in key], lost, rounds)
+
+
+def remove_session(sparse_map: SparseMap, session: str) -> SparseMap:
+    """Remove the key frames that were added under a name, and the points that no other key frame sees.
+
+    Where nothing was added since, this is the map as it was before, bit for bit.
+
+    Raises:
+        InputError: where the map has no such session.
+    """
+    if session not in sparse_map.sessions:
+        added = ", ".join(sparse_map.sessions) or "nothing"
+        raise InputError(f"{session}: was never added to the map of {sparse_map.scene}. What was added: {added}.")
+    names = list(sparse_map.sessions)
+    later = sum(sparse_map.sessions[name] for name in names[names.index(session) + 1 :])
+    end = len(sparse_map.key_poses) - later
+    gone = np.arange(end - sparse_map.sessions[session], end)
+    is_seen = np.delete(sparse_map.is_seen, gone, axis=1)
+    kept = is_seen.any(axis=1)
+    return replace(
+        sparse_map,
+        points_m=sparse_map.points_m[kept],
+        descriptors=sparse_map.descriptors[kept],
+        views=np.packbits(is_seen[kept], axis=1),
+        key_poses=np.delete(sparse_map.key_poses, gone, axis=0),
+        digests=_without(sparse_map.digests, session),
+        sessions=_without(sparse_map.sessions, session),
+    )
+
+
+def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -> tuple[dict[int, CameraPose], int]:
+    """Poses of the frames that the map finds, in its own frame, and how many contradict those given."""
+    localiser, unit_m = MapLocaliser(sparse_map), spread_m(sparse_map.key_poses)
+    found, contradict = {}, 0
+    for row in rows:
+        given = frames[row].given
+        located = localiser.localise_features(frames[row].features, given)
+        if located.is_accepted and located.inliers >= _INLIERS * sparse_map.least_inliers:
+            pose = CameraPose(matrix_from_quaternion(located.quaternion), located.position_m)
+            if given is None or _agree(pose, given, unit_m):
+                found[row] = localiser.drift.to_adjusted(pose)
+            else:
+                contradict += 1
+    return found, contradict
+
+
+def _grown(
+    sparse_map: SparseMap,
+    frames: Sequence[NewFrame],
+    matched: Callable[[int, int], NDArray[np.int64]],
+    poses: dict[int, CameraPose],
+    session: str,
+    most: int,
+) -> tuple[SparseMap, list[int]]:
+    """The map with frames whose poses are known, and which became key frames; their poses are adjusted in place."""
+    rows = np.array(sorted(poses))
+    key = rows[farthest_first(np.stack([poses[row].matrix for row in rows]), most)].tolist()
+    localiser = MapLocaliser(sparse_map)
+    given = [localiser.drift.to_adjusted(pose).matrix for row in key if (pose := frames[row].given) is not None]
+    new = extend(
+        localiser,
+        [frames[row].features for row in key],
+        lambda first, second: matched(key[first], key[second]),
+        np.stack([poses[row].matrix for row in key]),
+        np.stack(given) if len(given) == len(key) else None,
+    )
+    for row, pose in zip(key, new.world_from_cam, strict=True):
+        poses[row] = CameraPose(pose[:3, :3], pose[:3, 3])
+    unseen = np.zeros((len(new.points_m), len(sparse_map.key_poses)), bool)
+    views = np.block([[sparse_map.is_seen, new.views], [unseen, new.new_views]])
+    grown = replace(
+        sparse_map,
+        points_m=np.concatenate((sparse_map.points_m, new.points_m.astype(np.float32))),
+        descriptors=np.concatenate((sparse_map.descriptors, quantized(new.descriptors))),
+        views=np.packbits(views, axis=1),
+        key_poses=np.concatenate((sparse_map.key_poses, new.world_from_cam)),
+        digests={**sparse_map.digests, session: hashlib.sha256(new.world_from_cam.tobytes()).hexdigest()},
+        sessions={**sparse_map.sessions, session: len(key)},
+    )
+    return grown, key
+
+
+def _agree(pose: CameraPose, given: CameraPose, unit_m: float) -> bool:
+    cosine = (np.trace(pose.rotation.T @ given.rotation) - 1) / 2
+    off_m = np.linalg.norm(pose.position_m - given.position_m)
+    return bool(off_m <= _FARTHEST * unit_m and cosine >= np.cos(np.radians(_FARTHEST_DEG)))
+
+
+def _why_none(session: str, frames: int, contradict: int) -> str:
+    if contradict:
+        return (
+            f"{session}: its poses contradict the map, which finds {contradict} of {frames} frames elsewhere. "
+            "Give the pictures' folder, without poses."
+        )
+    return (
+        f"{session}: the map finds none of {frames} frames. Check that they show the same place and that --intrinsics "
+        "are theirs, and start filming where the map was built."
+    )
+
+
+def _without(names: dict[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in names.items() if key != name}

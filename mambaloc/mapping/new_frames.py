@@ -1,0 +1,102 @@
+"""Frames to add to a map: of a scene with poses, of a folder of pictures, or of a film."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from mambaloc.data.datasets.capture import is_captured
+from mambaloc.errors import InputError
+from mambaloc.images import read_image
+from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.growing import NewFrame
+from mambaloc.mapping.recipe import recipe_of
+from mambaloc.runtime.maps import CameraPose, MapLocaliser
+from mambaloc.runtime.sources import frames_of
+
+_MOST_FRAMES = 400  # of a film; two a second of three minutes
+_FOCAL_SCALES = (0.7, 0.84, 1.0, 1.2, 1.44)
+_FOCAL_FRAMES = 8
+_CLEARLY_MORE = 1.3
+
+
+def read_new_frames(
+    source: Path, localiser: MapLocaliser, intrinsics: NDArray[np.float64] | None = None
+) -> list[NewFrame]:
+    """Read frames and find their keypoints.
+
+    Args:
+        source: an imported scene's folder or a recipe, whose training frames have poses and cameras; a folder of
+            pictures, or a film, of which up to 400 frames are read.
+        localiser: in the map that they are for.
+        intrinsics: (3, 3) of the pictures; the map's camera unless given.
+
+    Raises:
+        InputError: for what cannot be read, pictures of another shape than the map's without intrinsics, and pictures
+            that clearly fit another focal length than the map's.
+    """
+    if source.suffix in (".yaml", ".yml") or (source.is_dir() and is_captured(source)):
+        if intrinsics is not None:
+            raise InputError(f"{source}: says what its cameras are. Leave out --intrinsics.")
+        return list(_posed(source, localiser))
+    frames = list(_unposed(source, localiser, intrinsics))
+    if intrinsics is None:
+        _check_focal_length(source, localiser, frames)
+    return frames
+
+
+def _posed(source: Path, localiser: MapLocaliser) -> Iterator[NewFrame]:
+    frames = read_frames(recipe_of(source), "train")
+    for image, intrinsics, pose in track(
+        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True),
+        "keypoints",
+        len(frames),
+        transient=True,
+    ):
+        features = localiser.features(read_image(image) if isinstance(image, Path) else image, intrinsics)
+        yield NewFrame(Path(str(image)).name, features, CameraPose(pose[:3, :3], pose[:3, 3]))
+
+
+def _unposed(source: Path, localiser: MapLocaliser, intrinsics: NDArray[np.float64] | None) -> Iterator[NewFrame]:
+    frames, count = frames_of(source)
+    if count is None:  # some films do not say; they are decoded twice
+        count = sum(1 for _ in frames)
+        frames = frames_of(source)[0]
+    step = max(1, -(-count // _MOST_FRAMES))
+    chosen = itertools.islice(frames, 0, None, step)
+    for frame in track(chosen, "keypoints", -(-count // step), transient=True):
+        yield NewFrame(frame.name, localiser.features(frame.image, intrinsics))
+
+
+def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[NewFrame]) -> None:
+    """Refuse pictures of another camera of the same shape, which would bend what they add."""
+    some = [frames[row] for row in np.unique(np.linspace(0, len(frames) - 1, _FOCAL_FRAMES).round().astype(int))]
+    inliers = {}
+    for scale in _FOCAL_SCALES:
+        zoom = np.diag((scale, scale, 1))
+        zoom[:2, 2] = (1 - scale) * some[0].features.intrinsics[:2, 2]
+        zoomed = [replace(frame.features, intrinsics=zoom @ frame.features.intrinsics) for frame in some]
+        found = [localiser.localise_features(features) for features in zoomed]
+        inliers[scale] = sum(each.inliers for each in found if each.is_accepted)
+    best = max(inliers, key=lambda scale: inliers[scale])
+    if inliers[best] > _CLEARLY_MORE * inliers[1.0]:
+        raise InputError(
+            f"{source}: its pictures fit a focal length about {best:g} times the map's. "
+            "Give their camera: --intrinsics FX,FY,CX,CY."
+        )
+
+
+def parse_intrinsics(text: str) -> NDArray[np.float64]:
+    """Read an option's focal lengths and centre, ``FX,FY,CX,CY`` in pixels, as a (3, 3) matrix, for :mod:`argparse`."""
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}: give four numbers, FX,FY,CX,CY") from None
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
