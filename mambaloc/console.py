@@ -11,6 +11,9 @@ from collections.abc import Callable, Iterable
 from functools import wraps
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mambaloc.errors import InputError, InputWarning
 
 _as_usual = warnings.formatwarning
@@ -70,13 +73,13 @@ thread_count = whole_number(1, 256)
 """Reads an option's number of threads."""
 
 
-def pinhole_matrix(text: str) -> list[list[float]]:
+def pinhole_matrix(text: str) -> NDArray[np.float64]:
     """Read an option's ``FX,FY,CX,CY`` as a (3, 3) matrix, for :mod:`argparse`."""
     try:
         fx, fy, cx, cy = map(float, text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text}: give FX,FY,CX,CY in pixels") from None
-    return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 def progress(items: Iterable[T], name: str, count: int) -> Iterable[T]:

@@ -13,11 +13,11 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import exits_cleanly, pinhole_matrix, quieten
 from mambaloc.errors import InputError
 from mambaloc.mapping.evaluating import build_and_measure, describe, measure, read_frames
 from mambaloc.mapping.growing import add_frames, remove_session
-from mambaloc.mapping.new_frames import parse_intrinsics, read_new_frames
+from mambaloc.mapping.new_frames import read_new_frames
 from mambaloc.mapping.recipe import recipe_of
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
 from mambaloc.viz.coverage import write_coverage
@@ -95,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     change.add_argument("--remove", metavar="NAME", help="what was added under this name")
     parser.add_argument("--name", help="of what is added, by which it may be removed; that of FRAMES unless given")
     parser.add_argument(
-        "--intrinsics", type=parse_intrinsics, metavar="FX,FY,CX,CY", help="of pictures to add; the map's unless given"
+        "--intrinsics", type=pinhole_matrix, metavar="FX,FY,CX,CY", help="of pictures to add; the map's unless given"
     )
     parser.add_argument("--test", type=Path, metavar="RECIPE|SCENE", help="measure the map on its test frames")
     return parser

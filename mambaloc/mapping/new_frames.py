@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -91,12 +90,3 @@ def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[
             f"{source}: its pictures fit a focal length about {best:g} times the map's. "
             "Give their camera: --intrinsics FX,FY,CX,CY."
         )
-
-
-def parse_intrinsics(text: str) -> NDArray[np.float64]:
-    """Read an option's focal lengths and centre, ``FX,FY,CX,CY`` in pixels, as a (3, 3) matrix, for :mod:`argparse`."""
-    try:
-        fx, fy, cx, cy = map(float, text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text}: give four numbers, FX,FY,CX,CY") from None
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
