@@ -107,4 +107,4 @@ def test_only_maps_grow(den, pictures, capsys):
 def test_intrinsics_are_four_numbers(folder, pictures, capsys):
     with pytest.raises(SystemExit):
         main(folder, "--add", pictures, "--intrinsics", "100,100")
-    assert "give four numbers, FX,FY,CX,CY" in capsys.readouterr().err
+    assert "give FX,FY,CX,CY in pixels" in capsys.readouterr().err

@@ -128,7 +128,8 @@ def _localise(
         found.setdefault("map", []).append((alone, alone.is_accepted, alone_s))
         if guess:
             guided, guided_s = _timed(localiser.localise, picture, intrinsics, prior)
-            found.setdefault("both", []).append((combined(guess, guided), guided.is_accepted, network_s + guided_s))
+            both = combined(guess, guided)
+            found.setdefault("both", []).append((both, both.source == "map", network_s + guided_s))
     return found
 
 

@@ -69,7 +69,7 @@ def read_colmap(source: Path) -> Capture:
     )
 
 
-def _key(name: str) -> tuple[tuple[int, str, int], ...]:
+def _key(name: str) -> tuple[tuple[int, str, int, str], ...]:
     return natural(Path(name))
 
 

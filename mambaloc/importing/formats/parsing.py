@@ -149,10 +149,15 @@ def inside(folder: Path, name: Any, where: str) -> Path:
     return path
 
 
-def natural(path: Path) -> tuple[tuple[int, str, int], ...]:
+def natural(path: Path) -> tuple[tuple[int, str, int, str], ...]:
     """Key to sort files as a person does: ``2.jpg`` before ``10.jpg``."""
     words = re.split(r"([0-9]+)", path.as_posix())
-    return tuple((1, "", int(word)) if number % 2 else (0, word, 0) for number, word in enumerate(words))
+    # Digits by their count, then one by one: Python refuses to make an int of more than 4300.
+    numbers = [word.lstrip("0") for word in words]
+    return tuple(
+        (1, "", len(number), number) if place % 2 else (0, word, 0, "")
+        for place, (word, number) in enumerate(zip(words, numbers, strict=True))
+    )
 
 
 def pictures(folder: Path) -> list[Path]:
