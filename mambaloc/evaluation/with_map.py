@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from mambaloc.console import progress
 from mambaloc.data import Frames, PoseDataModule
+from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.files import sha256
 from mambaloc.images import read_image
-from mambaloc.mapping.evaluating import MapErrors, with_cameras
+from mambaloc.mapping.evaluating import MapErrors
 from mambaloc.metrics import PoseErrorTable
 from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
-from mambaloc.runtime.rotations import matrix_from_quaternion
 
 RUN_MAP = Path("map", MAP_FILE)
 """Where a run keeps its map."""
@@ -77,7 +77,7 @@ class MeasuredMap:
         """
         poses = (network.predicted_position_m.cpu().numpy(), network.predicted_quaternion.cpu().numpy())
         said = [Localisation(position_m, quaternion, 0.0) for position_m, quaternion in zip(*poses, strict=True)]
-        priors = [CameraPose(matrix_from_quaternion(each.quaternion), each.position_m) for each in said]
+        priors = [CameraPose.from_quaternion(each.quaternion, each.position_m) for each in said]
         found, cpu_s = _localise(self.localiser, self.frames, self.intrinsics, priors)
         answers = [combined(*both) for both in zip(said, found, strict=True)]
         is_accepted = np.array([answer.source == "map" for answer in answers])
@@ -110,7 +110,7 @@ def measure_map(path: Path, data: PoseDataModule) -> MeasuredMap:
     """
     data.setup("test")
     frames, localiser = data.frames("test"), MapLocaliser(SparseMap.load(path))
-    intrinsics = with_cameras(data.hparams["dataset"], data.folder, frames).intrinsics
+    intrinsics = frame_intrinsics(data.hparams["dataset"], data.folder, frames)
     found, cpu_s = _localise(localiser, frames, intrinsics, [None] * len(frames))
     is_accepted = np.array([each.is_accepted for each in found])
     return MeasuredMap(path, localiser, frames, intrinsics, Answers(_table(found, frames), is_accepted, cpu_s))

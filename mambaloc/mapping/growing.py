@@ -18,7 +18,6 @@ from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
 from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.viewpoints import spread_m
-from mambaloc.runtime.rotations import matrix_from_quaternion
 
 Floats = NDArray[np.floating[Any]]
 
@@ -143,7 +142,7 @@ def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -
         given = frames[row].given
         located = localiser.localise_features(frames[row].features, given)
         if located.is_accepted and located.inliers >= _INLIERS * sparse_map.least_inliers:
-            pose = CameraPose(matrix_from_quaternion(located.quaternion), located.position_m)
+            pose = CameraPose.from_quaternion(located.quaternion, located.position_m)
             if given is None or _agree(pose, given, unit_m):
                 found[row] = localiser.drift.to_adjusted(pose)
             else:

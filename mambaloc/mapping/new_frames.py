@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
+from mambaloc.console import progress
 from mambaloc.data.datasets.capture import is_captured
 from mambaloc.errors import InputError
 from mambaloc.images import read_image
@@ -53,11 +53,8 @@ def read_new_frames(
 
 def _posed(source: Path, localiser: MapLocaliser) -> Iterator[NewFrame]:
     frames = read_frames(recipe_of(source), "train")
-    for image, intrinsics, pose in track(
-        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True),
-        "keypoints",
-        len(frames),
-        transient=True,
+    for image, intrinsics, pose in progress(
+        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True), "keypoints", len(frames)
     ):
         features = localiser.features(read_image(image) if isinstance(image, Path) else image, intrinsics)
         yield NewFrame(Path(str(image)).name, features, CameraPose(pose[:3, :3], pose[:3, 3]))
@@ -70,7 +67,7 @@ def _unposed(source: Path, localiser: MapLocaliser, intrinsics: NDArray[np.float
         frames = frames_of(source)[0]
     step = max(1, -(-count // _MOST_FRAMES))
     chosen = itertools.islice(frames, 0, None, step)
-    for frame in track(chosen, "keypoints", -(-count // step), transient=True):
+    for frame in progress(chosen, "keypoints", -(-count // step)):
         yield NewFrame(frame.name, localiser.features(frame.image, intrinsics))
 
 

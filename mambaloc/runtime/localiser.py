@@ -16,7 +16,6 @@ from mambaloc.runtime.contract import MODEL_FILES, Contract
 from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
 from mambaloc.runtime.network import Network
-from mambaloc.runtime.rotations import matrix_from_quaternion
 from mambaloc.runtime.sources import SourceFrame, frames_of
 
 
@@ -108,7 +107,7 @@ class Localiser:
             return None
         if network is None:
             return self._map.localise(rgb, intrinsics)
-        prior = CameraPose(matrix_from_quaternion(network.quaternion), network.position_m)
+        prior = CameraPose.from_quaternion(network.quaternion, network.position_m)
         try:
             return self._map.localise(rgb, intrinsics, prior)
         except InputError as error:

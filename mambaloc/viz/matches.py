@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from mambaloc.images import Image, read_image
 from mambaloc.mapping import PosedFrames
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
-from mambaloc.runtime.rotations import matrix_from_quaternion
 from mambaloc.viz.png import write_png
 
 _MATCHED, _UNMATCHED, _LOST = "#7CFC00", "#dddddd", "#ff5a4d"
@@ -63,7 +62,7 @@ def look(localiser: MapLocaliser, image: Image, intrinsics: NDArray[np.float64])
     found = localiser.localise_features(features)
     is_matched = np.zeros(len(features), bool)
     if np.isfinite(found.position_m).all():
-        pose = CameraPose(matrix_from_quaternion(found.quaternion), found.position_m)
+        pose = CameraPose.from_quaternion(found.quaternion, found.position_m)
         is_matched[localiser.matches(features, localiser.drift.to_adjusted(pose))[0]] = True
     scale = image.shape[1] / features.size[0]
     return Seen(image, (features.pixels + 0.5) * scale - 0.5, is_matched, found.is_accepted)

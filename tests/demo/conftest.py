@@ -1,6 +1,7 @@
 """A site, served, and a browser to look at it with; what costs seconds is made once for all workers, and read only."""
 
 import shutil
+import subprocess
 import threading
 from contextlib import contextmanager, suppress
 
@@ -22,6 +23,18 @@ SWITCHES = [
     "--disable-sync",
     "--disable-quic",
 ]
+
+
+@pytest.fixture(scope="session")
+def node():
+    """Run a script in Node, and return what it prints."""
+
+    def run(*words, **options):
+        done = subprocess.run(["node", *map(str, words)], capture_output=True, text=True, check=False, **options)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """The page's own modules find in a map what OpenCV and Python find."""
 
 import json
-import subprocess
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -24,12 +23,6 @@ HERE = Path(__file__).parent
 WEB = resources.files("mambaloc.demo") / "web"
 
 
-def node(*words, **options):
-    done = subprocess.run(["node", *map(str, words)], capture_output=True, text=True, check=False, **options)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def pictures(den):
     """Pictures with their scale: as it is; smaller by 4 and by an odd share; RGBA; too many keypoints; hardly any."""
     room = read_image(sorted((den / "den/seq-02").glob("*.color.png"))[1])
@@ -45,7 +38,7 @@ def pictures(den):
 
 
 @pytest.fixture(scope="module")
-def found(den, tmp_path_factory):
+def found(den, tmp_path_factory, node):
     """Each picture's grey one, keypoints and descriptors, by OpenCV and by the page."""
     folder, cases, expected = tmp_path_factory.mktemp("features"), [], []
     sift = cv2.SIFT.create(1000, contrastThreshold=0.02, enable_precise_upscale=True)
@@ -107,7 +100,7 @@ def unit(rays):
 
 
 @pytest.fixture(scope="module")
-def solved():
+def solved(node):
     """Problems whose poses are known, and what the page finds; of many points, a third are outliers."""
     rng = np.random.default_rng(1)
     threes = [random_problem(rng, 3) for _ in range(200)]
@@ -182,7 +175,7 @@ def adjusted(path, folder):
     return folder / "adjusted.safetensors"
 
 
-def test_drift_is_pythons(map_of_den, tmp_path):
+def test_drift_is_pythons(map_of_den, tmp_path, node):
     sparse_map = SparseMap.load(adjusted(map_of_den, tmp_path))
     poses = sparse_map.key_poses[::5].copy()
     poses[:, :3, 3] += 0.2
@@ -203,7 +196,7 @@ def test_drift_is_pythons(map_of_den, tmp_path):
 
 
 @pytest.mark.parametrize("is_adjusted", [False, True], ids=["as_it_is", "adjusted"])
-def test_poses_in_a_map_are_pythons(den, map_of_den, is_adjusted, modules, tmp_path):
+def test_poses_in_a_map_are_pythons(den, map_of_den, is_adjusted, modules, tmp_path, node):
     map_of_den = adjusted(map_of_den, tmp_path) if is_adjusted else map_of_den
     frames = sorted((den / "den/seq-02").glob("*.color.png"))
     large, black = tmp_path / "large.png", tmp_path / "black.png"

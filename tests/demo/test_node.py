@@ -18,17 +18,11 @@ HERE = Path(__file__).parent
 WEB = resources.files("mambaloc.demo") / "web"
 
 
-def node(*words, **options):
-    done = subprocess.run(["node", *map(str, words)], capture_output=True, text=True, check=False, **options)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 @pytest.mark.parametrize(
     ("which", "model"),
     [("bundle", "model.onnx"), ("raw_bundle", "model.onnx"), ("raw_bundle", "model.fp16.onnx")],
 )
-def test_poses_in_node_are_pythons(which, model, modules, request):
+def test_poses_in_node_are_pythons(which, model, modules, request, node):
     folder = request.getfixturevalue(which)
     found = json.loads(node(HERE / "replay.mjs", modules, WEB, folder, model))
     localiser = Localiser(folder / model)
@@ -53,7 +47,7 @@ CASES = [  # (height, width) of the picture, short side, crop
 ]
 
 
-def test_pictures_look_to_the_page_as_to_opencv(tmp_path):
+def test_pictures_look_to_the_page_as_to_opencv(tmp_path, node):
     told = []
     for number, ((height, width), short_side, crop) in enumerate(CASES):
         rgb = np.random.default_rng(number).integers(0, 256, (height, width, 3), dtype=np.uint8)
@@ -82,13 +76,13 @@ def test_the_page_on_pcs_in_python(raw_bundle, model, tmp_path):
     assert done.stdout == "the port is right\n", done.stderr
 
 
-def test_the_page_on_pcs_in_node(raw_bundle, modules, tmp_path):
+def test_the_page_on_pcs_in_node(raw_bundle, modules, tmp_path, node):
     (tmp_path / "node_modules").symlink_to(modules)
     (tmp_path / "localise.mjs").write_text(code_of("pc.md", "js", "localise.mjs"))
     assert node(tmp_path / "localise.mjs", raw_bundle, cwd=tmp_path) == "the port is right\n"
 
 
-def test_the_page_on_the_web(raw_bundle, modules, tmp_path):
+def test_the_page_on_the_web(raw_bundle, modules, tmp_path, node):
     """Its class and its check, with the build for Node in place of the browser's."""
     (tmp_path / "node_modules").symlink_to(modules)
     code = code_of("web.md", "js", "// localiser.js").replace("./ort/ort.wasm.min.mjs", "onnxruntime-web")

@@ -19,7 +19,7 @@ from mambaloc.runtime import Localiser
 from mambaloc.runtime.localisation import combined
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
 from mambaloc.runtime.maps.features import rescaled_intrinsics
-from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_error_deg
+from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.float64]
 T = TypeVar("T")
@@ -121,7 +121,7 @@ def _localise(
     guess, network_s, prior = None, 0.0, None
     if network:
         guess, network_s = _timed(network.localise, picture)
-        prior = CameraPose(matrix_from_quaternion(guess.quaternion), guess.position_m)
+        prior = CameraPose.from_quaternion(guess.quaternion, guess.position_m)
         found["network"] = [(guess, False, network_s)]
     for localiser in localisers:
         alone, alone_s = _timed(localiser.localise, picture, intrinsics)

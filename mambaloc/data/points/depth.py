@@ -74,7 +74,7 @@ def read_depth_mm(path: Path) -> NDArray[np.uint16]:
     """Read a depth frame, (H, W).
 
     Raises:
-        InputError: where it is no whole 16-bit PNG of one channel.
+        InputError: where it is not a complete 16-bit PNG of one channel.
     """
     try:
         data = path.read_bytes()
@@ -97,7 +97,7 @@ def read_depth_intrinsics(folder: Path, size: tuple[int, int]) -> NDArray[np.flo
     """The camera of depth frames of a size (width, height), (3, 3).
 
     Raises:
-        InputError: where the folder's file of it is no pinhole matrix.
+        InputError: where the folder's file of it does not hold a pinhole matrix.
     """
     path = folder / INTRINSICS_FILE
     if not path.is_file():

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from mambaloc.runtime.rotations import matrix_from_quaternion
 
 Floats = NDArray[np.floating[Any]]
 
@@ -22,6 +24,11 @@ class CameraPose:
 
     rotation: Floats
     position_m: Floats
+
+    @classmethod
+    def from_quaternion(cls, quaternion: ArrayLike, position_m: Floats) -> Self:
+        """Of a unit quaternion (4,), wxyz."""
+        return cls(matrix_from_quaternion(quaternion), position_m)
 
     @property
     def matrix(self) -> Floats:

@@ -89,6 +89,7 @@ class MapLocaliser:
         self._views = sparse_map.is_seen
         # A map's first points are in this order; those that were added to it are not.
         self._often = np.argsort(-self._views.sum(axis=1), kind="stable")[:_AT_ONCE]
+        self._near = near_px(sparse_map.size[0]) / sparse_map.intrinsics[0, 0]  # in the plane at depth 1
         self._unit_m = spread_m(sparse_map.key_poses)
         self._viewpoints = viewpoints(sparse_map.key_poses, self._unit_m)
         drift = sparse_map.drift if len(sparse_map.drift) else np.zeros((len(sparse_map.key_poses), 6))
@@ -121,16 +122,15 @@ class MapLocaliser:
 
     def localise_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalisation:
         """Localise a picture whose keypoints :meth:`features` found."""
-        near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
         best, is_clear = unambiguous(features.descriptors @ self._descriptors[self._often].T, _RATIO)
         rng = np.random.default_rng(self.seed)
-        start = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], near, rng)
-        found = self._settled(features, start, near)
+        start = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], self._near, rng)
+        found = self._settled(features, start)
         if prior is None or found.is_accepted:
             return found
-        keypoints, points = self._search(features, self.drift.to_adjusted(prior), _PRIOR_WINDOW * near)
-        start = ransac_pose(self._points_m[points], features.rays[keypoints], near, rng)
-        both = [self._confirmed(each, prior) for each in (found, self._settled(features, start, near))]
+        keypoints, points = self._search(features, self.drift.to_adjusted(prior), _PRIOR_WINDOW * self._near)
+        start = ransac_pose(self._points_m[points], features.rays[keypoints], self._near, rng)
+        both = [self._confirmed(each, prior) for each in (found, self._settled(features, start))]
         return max(both, key=lambda each: (each.is_accepted, each.is_confirmed, each.inliers))
 
     def _confirmed(self, found: MapLocalisation, prior: CameraPose) -> MapLocalisation:
@@ -142,10 +142,11 @@ class MapLocaliser:
         )
         return replace(found, is_confirmed=bool(is_near and is_fixed))
 
-    def _settled(self, features: Features, start: CameraPose | None, near: float) -> MapLocalisation:
+    def _settled(self, features: Features, start: CameraPose | None) -> MapLocalisation:
         """Search around a pose and refine it, twice."""
         if start is None:
             return _nowhere()
+        near = self._near
         pose, scale = start, near / 2  # of the refinement; finer where the matches are
         for window in _WINDOWS:
             keypoints, points = self._search(features, pose, window * near)
@@ -157,15 +158,14 @@ class MapLocaliser:
             scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
         inliers = int((off <= near).sum())
         is_fixed = _deviation_m(covariance) <= _MOST_DEVIATION * self._unit_m
-        is_accepted = inliers >= self.map.least_inliers and bool(is_fixed)
+        is_accepted = inliers >= self.map.least_inliers and is_fixed
         pose, unsure = self.drift.to_given(pose)
         covariance = covariance + unsure
         return MapLocalisation(pose.position_m, quaternion_from_matrix(pose.rotation), inliers, is_accepted, covariance)
 
     def matches(self, features: Features, pose: CameraPose) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Points that a picture shows where its pose projects them: rows of keypoints and of points."""
-        near = near_px(self.map.size[0]) / self.map.intrinsics[0, 0]
-        return self._search(features, pose, near)
+        return self._search(features, pose, self._near)
 
     def _search(
         self, features: Features, pose: CameraPose, radius: float
