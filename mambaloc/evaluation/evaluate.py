@@ -144,8 +144,7 @@ def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, both: Answe
         if both is None:
             draw_trajectory(table, frames.sequences, out / "trajectory.png", title)
             return
-        sources = ["map" if each else "network" for each in both.is_accepted]
-        write_predictions(out / "predictions_both.csv", both.table, frames, sources)
+        write_predictions(out / "predictions_both.csv", both.table, frames, both.sources)
         title = f"{result['model']['name']} and map on {result['data']['scene']}, test, {trained.chosen} epoch"
         draw_trajectory(both.table, frames.sequences, out / "trajectory.png", title, table)
 

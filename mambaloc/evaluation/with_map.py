@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -20,10 +20,11 @@ from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.files import sha256
 from mambaloc.images import read_image
-from mambaloc.mapping.evaluating import MapErrors
+from mambaloc.mapping.evaluating import MapErrors, covers
 from mambaloc.metrics import PoseErrorTable
 from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
+from mambaloc.runtime.rotations import matrix_from_quaternion
 
 RUN_MAP = Path("map", MAP_FILE)
 """Where a run keeps its map."""
@@ -37,18 +38,33 @@ class Answers:
 
     Args:
         table: the answers and their errors, a row a frame.
+        sources: what gave each, ``map`` or ``network``.
         is_accepted: which of them are poses that the map accepts, (N,).
+        is_covered: which true poses are inside the 90 % ellipsoid of the answer's covariance, (N,).
         cpu_s: CPU time that the map took on all cores, without decoding the picture, (N,).
     """
 
     table: PoseErrorTable
+    sources: list[str]
     is_accepted: NDArray[np.bool_]
+    is_covered: NDArray[np.bool_]
     cpu_s: Floats
+
+    @classmethod
+    def of(cls, found: Sequence[MapLocalisation | Localisation], frames: Frames, cpu_s: Floats) -> Self:
+        """Compare answers with the frames' true poses."""
+        truths = np.tile(np.eye(4), (len(frames), 1, 1))
+        truths[:, :3, :3], truths[:, :3, 3] = matrix_from_quaternion(frames.quaternion), frames.position_m
+        pairs = zip(found, truths, strict=True)
+        covered = [covers(it.position_m, it.quaternion, it.covariance, truth) for it, truth in pairs]
+        sources = ["map" if isinstance(it, MapLocalisation) else str(it.source) for it in found]
+        is_accepted = np.array([it.is_accepted for it in found])
+        return cls(_table(found, frames), sources, is_accepted, np.array(covered), cpu_s)
 
     def summary(self) -> dict[str, float]:
         """As :meth:`mambaloc.mapping.evaluating.MapErrors.summary`."""
         errors = (self.table.position_error_m.numpy(), self.table.rotation_error_deg.numpy())
-        return MapErrors(*errors, self.is_accepted, self.cpu_s).summary()
+        return MapErrors(*errors, self.is_accepted, self.is_covered, self.cpu_s).summary()
 
 
 @dataclass(frozen=True)
@@ -70,7 +86,7 @@ class MeasuredMap:
     alone: Answers
 
     def beside(self, network: PoseErrorTable) -> Answers:
-        """Localise each frame around a network's pose, which is the answer where the map's is not accepted.
+        """Localise each frame around a network's pose, which is the answer where the map's is not likelier to be right.
 
         Args:
             network: its answers about the same frames.
@@ -80,8 +96,7 @@ class MeasuredMap:
         priors = [CameraPose.from_quaternion(each.quaternion, each.position_m) for each in said]
         found, cpu_s = _localise(self.localiser, self.frames, self.intrinsics, priors)
         answers = [combined(*both) for both in zip(said, found, strict=True)]
-        is_accepted = np.array([answer.source == "map" for answer in answers])
-        return Answers(_table(answers, self.frames), is_accepted, cpu_s)
+        return Answers.of(answers, self.frames, cpu_s)
 
     def describe(self) -> dict[str, Any]:
         """Which map it is, and how it answered."""
@@ -112,8 +127,7 @@ def measure_map(path: Path, data: PoseDataModule) -> MeasuredMap:
     frames, localiser = data.frames("test"), MapLocaliser(SparseMap.load(path))
     intrinsics = frame_intrinsics(data.hparams["dataset"], data.folder, frames)
     found, cpu_s = _localise(localiser, frames, intrinsics, [None] * len(frames))
-    is_accepted = np.array([each.is_accepted for each in found])
-    return MeasuredMap(path, localiser, frames, intrinsics, Answers(_table(found, frames), is_accepted, cpu_s))
+    return MeasuredMap(path, localiser, frames, intrinsics, Answers.of(found, frames, cpu_s))
 
 
 def measure_map_of_run(run: Path, data: PoseDataModule) -> MeasuredMap | None:

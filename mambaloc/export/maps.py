@@ -13,6 +13,7 @@ from mambaloc.data.frames import Frames
 from mambaloc.errors import InputError
 from mambaloc.images import read_image
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
+from mambaloc.runtime.maps.acceptance import CALIBRATION, LEAST_PROBABILITY, RULE
 from mambaloc.runtime.maps.radii import LEVEL
 from mambaloc.runtime.maps.viewpoints import spread_m
 from mambaloc.runtime.rotations import rotation_error_deg
@@ -71,7 +72,12 @@ def describe_map(sparse_map: SparseMap) -> dict[str, Any]:
         "intrinsics": sparse_map.intrinsics.tolist(),
         "points": len(sparse_map),
         "key_frames": len(sparse_map.key_poses),
-        "accepted": {"least_inliers": sparse_map.least_inliers},
+        "accepted": {
+            "rule": RULE,
+            "least_probability": LEAST_PROBABILITY,
+            "least_inliers": sparse_map.least_inliers,
+            "calibrated_on": CALIBRATION,
+        },
         "covariance": _COVARIANCE,
         "level": LEVEL,
         "allowed": _ALLOWED,

@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from mambaloc import provenance
 from mambaloc.console import progress
@@ -25,6 +27,7 @@ from mambaloc.mapping.building import PosedFrames, build_map
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.metrics import summarise_errors
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
+from mambaloc.runtime.maps.radii import LEVEL
 from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.float64]
@@ -38,15 +41,27 @@ class MapErrors:
 
     Shape:
         all (N,): errors are infinite where there was no pose.
+
+    Args:
+        position_m: errors.
+        rotation_deg: errors.
+        is_accepted: which poses the map accepts.
+        is_covered: which true poses are inside the 90 % ellipsoid of the answer's covariance.
+        cpu_s: CPU time of each.
     """
 
     position_m: Floats
     rotation_deg: Floats
     is_accepted: NDArray[np.bool_]
+    is_covered: NDArray[np.bool_]
     cpu_s: Floats
 
     def summary(self) -> dict[str, float]:
-        """As :func:`~mambaloc.metrics.summarise_errors`, and how often a pose is accepted, and wrong all the same."""
+        """As :func:`~mambaloc.metrics.summarise_errors`, and what becomes of accepted poses.
+
+        ``accepted_and_wrong`` and ``covariance_90`` are shares of accepted poses: of those more than 0.2 m or 5 degrees
+        off, and of those whose covariance covers the truth.
+        """
         is_wrong = (self.position_m > _WRONG[0]) | (self.rotation_deg > _WRONG[1])
         return {
             **summarise_errors(self.position_m, self.rotation_deg),
@@ -54,6 +69,7 @@ class MapErrors:
             "above_20cm": float((self.position_m > _WRONG[0]).mean()),
             "accepted": float(self.is_accepted.mean()),
             "accepted_and_wrong": float((is_wrong & self.is_accepted).sum() / max(self.is_accepted.sum(), 1)),
+            "covariance_90": float((self.is_covered & self.is_accepted).sum() / max(self.is_accepted.sum(), 1)),
             "query_cpu_ms": float(1000 * self.cpu_s.mean()),
         }
 
@@ -100,10 +116,22 @@ def measure(sparse_map: SparseMap, frames: PosedFrames, seeds: Sequence[int]) ->
             taken_s = time.process_time() - start
             off_m = np.linalg.norm(found.position_m - truth[:3, 3])
             off_deg = rotation_error_deg(found.quaternion, quaternion_from_matrix(truth[:3, :3]))
-            rows.append((off_m, off_deg, found.is_accepted, taken_s))
-    position_m, rotation_deg, is_accepted, cpu_s = (np.array(each) for each in zip(*rows, strict=True))
+            inside = covers(found.position_m, found.quaternion, found.covariance, truth)
+            rows.append((off_m, off_deg, found.is_accepted, inside, taken_s))
+    position_m, rotation_deg, is_accepted, is_covered, cpu_s = (np.array(each) for each in zip(*rows, strict=True))
     position_m, rotation_deg = (np.where(np.isnan(each), np.inf, each) for each in (position_m, rotation_deg))
-    return MapErrors(position_m, rotation_deg, is_accepted, cpu_s)
+    return MapErrors(position_m, rotation_deg, is_accepted, is_covered, cpu_s)
+
+
+def covers(position_m: ArrayLike, quaternion: ArrayLike, covariance: ArrayLike | None, truth: Floats) -> bool:
+    """Whether a true pose, (4, 4), is inside the 90 % ellipsoid of an answer's covariance; False without one."""
+    if covariance is None or not np.isfinite(covariance).all():
+        return False
+    turn = Rotation.from_matrix(truth[:3, :3] @ matrix_from_quaternion(quaternion).T).as_rotvec()
+    off = np.concatenate((truth[:3, 3] - np.asarray(position_m), turn))
+    return bool(
+        off @ np.linalg.pinv(np.asarray(covariance, np.float64), hermitian=True) @ off <= chi2.ppf(LEVEL, len(off))
+    )
 
 
 def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:

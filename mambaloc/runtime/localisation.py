@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -12,6 +13,9 @@ from mambaloc.runtime.maps import MapLocalisation
 from mambaloc.runtime.maps.radii import covariance_radius
 
 Floats = NDArray[np.floating[Any]]
+
+_RIGHT_M, _RIGHT_DEG = 0.2, 5.0
+_UNSTATED = 0.25  # probability that a network's pose is right which says nothing: pictures that a map rejects are bad
 
 
 @dataclass(frozen=True)
@@ -27,14 +31,16 @@ class Localisation:
         quaternion: of the same pose.
         latency_s: seconds that it took, without decoding the image.
         position_radius_m: nine of ten poses are within this, as the model's contract says, or the covariance where the
-            map answers; None where the network answers and its model does not tell.
+            map's pose is accepted; None where neither says.
         rotation_radius_deg: the same of the rotation.
         unfamiliarity: how far the image is from those that the network was trained on; over 1, hardly any frame of the
             place is. None where the model does not tell.
         source: what found the pose; None where nothing did.
         inliers: matches that agree with the map's pose, accepted or not; None where there is no map.
-        covariance: where the map answers, of the position in metres, then of the rotation in radians about the fixed
-            axes of the world, as ROS's PoseWithCovariance has it.
+        covariance: where the map's pose is accepted, of the position in metres, then of the rotation in radians about
+            the fixed axes of the world, as ROS's PoseWithCovariance has it. None otherwise.
+        focal_scale: how many times the given focal length the map's matches ask for; None where they do not contradict
+            it, and where there is no map.
     """
 
     position_m: Floats
@@ -46,6 +52,12 @@ class Localisation:
     source: Literal["network", "map"] | None = "network"
     inliers: int | None = None
     covariance: Floats | None = None
+    focal_scale: float | None = None
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether it is a pose that the map accepts."""
+        return self.covariance is not None
 
     @property
     def is_unfamiliar(self) -> bool:
@@ -57,26 +69,36 @@ class Localisation:
 
 
 def combined(network: Localisation | None, found: MapLocalisation) -> Localisation:
-    """The map's pose where it is accepted, or where the network's confirms it; otherwise the network's, otherwise none.
+    """The map's pose where it is accepted, or likelier to be right than the network's; otherwise the network's.
 
-    Everything that has both a network and a map decides here: apps' runtime, evaluation and benchmarks. Where a pose is
-    only confirmed, the network's radii stand.
+    Everything that has both a network and a map decides here: apps' runtime, evaluation and benchmarks. Without a
+    network, only an accepted pose is an answer. Where a pose is not accepted, the network's radii stand.
 
     Args:
         network: its answer; None where there is no network.
         found: the map's answer about the same image, with the network's pose as prior.
     """
     lost = Localisation(np.full(3, np.nan), np.full(4, np.nan), 0.0, source=None)
-    base = replace(network or lost, inliers=found.inliers)
-    if not (found.is_accepted or found.is_confirmed):
+    base = replace(network or lost, inliers=found.inliers, focal_scale=found.focal_scale)
+    if not found.is_accepted and (network is None or found.probability <= _probability(network)):
         return base
-    answer = replace(
-        base, position_m=found.position_m, quaternion=found.quaternion, source="map", covariance=found.covariance
-    )
+    answer = replace(base, position_m=found.position_m, quaternion=found.quaternion, source="map")
     if not found.is_accepted:
         return answer
     return replace(
         answer,
+        covariance=found.covariance,
         position_radius_m=covariance_radius(found.covariance[:3, :3]),
         rotation_radius_deg=float(np.degrees(covariance_radius(found.covariance[3:, 3:]))),
     )
+
+
+def _probability(network: Localisation) -> float:
+    """That a network's pose is right, as the map's are: within 0.2 m and 5 degrees."""
+    if network.is_unfamiliar:
+        return 0.0
+    if network.position_radius_m is None or network.rotation_radius_deg is None:
+        return _UNSTATED
+    radii = _RIGHT_M / network.position_radius_m, _RIGHT_DEG / network.rotation_radius_deg
+    # Nine tenths of errors are within a radius; within so many radii are these, if errors are Rayleigh's.
+    return math.prod(1 - 0.1 ** (each**2) for each in radii)

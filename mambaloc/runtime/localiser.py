@@ -15,6 +15,7 @@ from mambaloc.images import Image, as_rgb, read_image
 from mambaloc.runtime.contract import MODEL_FILES, Contract
 from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
+from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY
 from mambaloc.runtime.network import Network
 from mambaloc.runtime.sources import SourceFrame, frames_of
 
@@ -22,8 +23,8 @@ from mambaloc.runtime.sources import SourceFrame, frames_of
 class Localiser:
     """A network, and a sparse map beside it.
 
-    The map's pose is the answer where it is accepted, and the network's otherwise. What keeps the map from being used,
-    such as a damaged file or a picture whose camera is unknown, is a warning, and the network answers.
+    The map's pose is the answer where it is accepted, or likelier to be right than the network's. What keeps the map
+    from being used, such as a damaged file or a picture whose camera is unknown, is a warning, and the network answers.
 
     Args:
         model: an ``.onnx`` or ``.ort`` file that ``tools/export.py`` wrote; a bundle's folder; or a ``.safetensors``
@@ -81,6 +82,8 @@ class Localiser:
         start = time.perf_counter()
         network = None if self._network is None else self._network.localise(rgb)
         in_map = self._localise_in_map(rgb, intrinsics, network)
+        if in_map is not None:
+            _warn_of_focal_length(in_map)
         answer = network if in_map is None else combined(network, in_map)
         assert answer is not None  # one of the two is there
         return replace(answer, latency_s=time.perf_counter() - start)
@@ -113,6 +116,20 @@ class Localiser:
         except InputError as error:
             warnings.warn(f"{error} The network answers without the map.", InputWarning, stacklevel=3)
             return None
+
+
+def _warn_of_focal_length(found: MapLocalisation) -> None:
+    """Where a pose would be accepted but for that; in steps of 5 %, so that a film's frames say it once."""
+    scale = found.focal_scale
+    if scale is None or found.evidence is None or found.evidence.probability < LEAST_PROBABILITY:
+        return
+    off = f"about {5 * max(1, round(20 * abs(scale - 1)))} % too {'short' if scale > 1 else 'long'}"
+    warnings.warn(
+        f"intrinsics: the map's matches say that their focal length is {off}, so its poses are not accepted. "
+        "Give the intrinsics of these pictures.",
+        InputWarning,
+        stacklevel=3,
+    )
 
 
 def _model_file(path: Path) -> Path:

@@ -96,7 +96,9 @@ def test_the_map_alone(measured, trained_with_map, unsure):
     assert result["map"]["metrics"]["query_cpu_ms"] > 0
 
 
-def test_both_are_the_map_where_it_is_accepted_and_the_network_elsewhere(measured, trained_with_map, unsure):
+def test_both_are_the_map_where_it_is_accepted_or_likelier_and_the_network_elsewhere(
+    measured, trained_with_map, unsure
+):
     result, out = measured
     network, both = rows_of(out / "predictions.csv"), rows_of(out / "predictions_both.csv")
     priors = [CameraPose(rotation.as_matrix(), position_m) for position_m, rotation in map(pose_of, network)]
@@ -104,18 +106,20 @@ def test_both_are_the_map_where_it_is_accepted_and_the_network_elsewhere(measure
     errors = []
     for alone, row, (true, each) in zip(network, both, found, strict=True):
         position_m, rotation = pose_of(row)
-        if each.is_accepted:
+        is_map = each.is_accepted or each.probability > 0.25  # this network does not say how sure it is
+        if is_map:
             expected_m, expected = each.position_m, Rotation.from_quat(np.roll(each.quaternion, -1))
         else:
             expected_m, expected = pose_of(alone)
-        assert row["source"] == ("map" if each.is_accepted else "network")
+        assert row["source"] == ("map" if is_map else "network")
         np.testing.assert_allclose(position_m, expected_m, atol=1e-5)
         assert np.degrees((rotation.inv() * expected).magnitude()) < 1e-2
         errors.append(error_of(position_m, rotation, true))
-    assert {row["source"] for row in both} == {"map", "network"}
     metrics = result["network_and_map"]["metrics"]
     assert_sums_up(metrics, errors)
-    assert metrics["accepted"] == np.mean([row["source"] == "map" for row in both])
+    assert metrics["accepted"] == np.mean([each.is_accepted for _, each in found])
+    assert 0 < metrics["accepted"] < 1
+    assert metrics["covariance_90"] <= 1
     assert metrics["position_error_worst_m"] < result["metrics"]["position_error_worst_m"] + 1e-9
     tum = np.loadtxt(out / "predictions_both.tum")
     np.testing.assert_allclose(tum[:, 1:4], [pose_of(row)[0] for row in both], atol=1e-6)

@@ -21,9 +21,9 @@ from mambaloc.export.maps import check_scene
 from mambaloc.export.precision import half_precision
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.models.student import LitStudent
-from mambaloc.runtime import Localiser, Preprocessing
+from mambaloc.runtime import Localiser, Preprocessing, localisation
 from mambaloc.runtime.bundle import verify_bundle
-from mambaloc.runtime.maps import SparseMap, absolute_pose, drift, features, lens, sparse_map, viewpoints
+from mambaloc.runtime.maps import SparseMap, absolute_pose, acceptance, drift, features, lens, sparse_map, viewpoints
 from mambaloc.runtime.maps import localiser as maps_localiser
 from mambaloc.runtime.maps.localiser import near_px
 
@@ -117,6 +117,8 @@ def test_a_map_is_described_with_poses_that_a_port_must_find(mapped, map_of_den,
     described = contract["map"]
     assert (described["points"], described["key_frames"]) == (len(sparse_map), len(sparse_map.key_poses))
     assert (described["scene"], described["size"], described["keypoints"]) == ("den", [160, 120], "sift")
+    assert described["accepted"]["least_probability"] == acceptance.LEAST_PROBABILITY
+    assert described["accepted"]["calibrated_on"]["frames"] > 100
     assert described["allowed"] == {"position_mm": 10, "rotation_deg": 0.3}
     frames = data.frames("test")
     chosen = frames.select(np.array(frames.evenly_spread(5)))
@@ -213,10 +215,12 @@ def test_native_apps_decide_as_python_does():
             maps_localiser._NEAREST,
             *maps_localiser._WINDOWS,
             maps_localiser._LEAST_SHARE,
-            maps_localiser._MOST_DEVIATION,
+            maps_localiser._PRIOR_WINDOW,
         ),
-        *(maps_localiser._PRIOR_WINDOW, maps_localiser._CONFIRMED_INLIERS, maps_localiser._CONFIRMED_DEVIATION),
-        *(maps_localiser._CONFIRMED_MOVE, maps_localiser._CONFIRMED_TURN_DEG),
+        *(acceptance._CELLS, acceptance.LEAST_PROBABILITY, localisation._UNSTATED),
+        *map(abs, (acceptance._CONSTANT, acceptance._PER_CELLS, acceptance._PER_DEVIATION, acceptance._PER_TURN)),
+        *(acceptance._LEAST_DEVIATION, acceptance._LEAST_TURN_DEG),
+        *(acceptance._FOCAL_OFF, acceptance._FOCAL_DEVIATIONS),
         *(near_px(160), drift._LENGTH, drift._NUGGET, viewpoints._TURN_DEG, lens._STEPS),
         *(absolute_pose._TRIALS, absolute_pose._CONFIDENCE, absolute_pose._STEPS),
         *(features._MOST_KEYPOINTS, features._CONTRAST, sparse_map.VERSION),

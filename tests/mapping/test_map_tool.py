@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from mambaloc.errors import InputError
 from mambaloc.mapping import evaluating
 from mambaloc.mapping.building import MapSettings
-from mambaloc.mapping.evaluating import MapErrors, build_and_measure
+from mambaloc.mapping.evaluating import MapErrors, build_and_measure, covers
 from mambaloc.mapping.recipe import MapRecipe, read_recipe
 from mambaloc.runtime.maps import SparseMap
 
@@ -83,7 +84,8 @@ def test_a_missing_recipe_and_too_few_frames_are_refused(tmp_path):
 
 
 def test_frames_without_a_pose_count_in_medians_and_shares_but_not_in_means():
-    lost = MapErrors(*np.array([[0.01, 0.03, np.inf], [1.0, 2.0, np.inf]]), np.array([1, 1, 0], bool), np.ones(3))
+    errors, covered = np.array([[0.01, 0.03, np.inf], [1.0, 2.0, np.inf]]), np.array([1, 0, 1], bool)
+    lost = MapErrors(*errors, np.array([1, 1, 0], bool), covered, np.ones(3))
     summary = lost.summary()
     assert summary["position_error_m"] == 0.03
     assert summary["position_error_mean_m"] == pytest.approx(0.02)
@@ -91,12 +93,32 @@ def test_frames_without_a_pose_count_in_medians_and_shares_but_not_in_means():
     assert summary["without_pose"] == summary["above_20cm"] == pytest.approx(1 / 3)
     assert summary["recall_10cm_5deg"] == pytest.approx(2 / 3)
     assert summary["accepted_and_wrong"] == 0
-    nowhere = MapErrors(np.full(3, np.inf), np.full(3, np.inf), np.zeros(3, bool), np.ones(3)).summary()
+    assert summary["covariance_90"] == 0.5  # of the two that are accepted
+    nowhere = MapErrors(
+        np.full(3, np.inf), np.full(3, np.inf), np.zeros(3, bool), np.zeros(3, bool), np.ones(3)
+    ).summary()
     assert nowhere["position_error_mean_m"] == nowhere["position_error_m"] == np.inf
 
 
+def test_truths_are_covered_by_ellipsoids_as_often_as_they_say():
+    """Errors are drawn from a covariance whose axes are turned; SciPy composes the rotations."""
+    rng = np.random.default_rng(0)
+    turn, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    axes = turn * [0.01, 0.02, 0.03, 0.001, 0.01, 0.03]
+    position_m, rotation = rng.normal(size=3), Rotation.random(random_state=1)
+    inside = []
+    for off in rng.normal(size=(4000, 6)) @ axes.T:
+        truth = np.eye(4)
+        truth[:3, :3] = (Rotation.from_rotvec(off[3:]) * rotation).as_matrix()
+        truth[:3, 3] = position_m + off[:3]
+        inside.append(covers(position_m, rotation.as_quat(scalar_first=True), axes @ axes.T, truth))
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.015)
+    assert not covers(position_m, rotation.as_quat(scalar_first=True), None, truth)
+    assert not covers(np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan), truth)
+
+
 def test_a_result_without_poses_is_written_as_json(den, tmp_path, monkeypatch):
-    nowhere = MapErrors(np.full(8, np.inf), np.full(8, np.inf), np.zeros(8, bool), np.ones(8))
+    nowhere = MapErrors(np.full(8, np.inf), np.full(8, np.inf), *np.zeros((2, 8), bool), np.ones(8))
     monkeypatch.setattr(evaluating, "measure", lambda *_: nowhere)
     recipe = MapRecipe("den", root=str(den), settings=MapSettings(30, 160), ransac_seeds=(0,))
     assert "worst inf m" in evaluating.describe(build_and_measure(recipe, tmp_path))

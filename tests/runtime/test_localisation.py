@@ -24,6 +24,7 @@ def test_an_accepted_pose_of_the_map_is_the_answer():
     assert answer.position_m.tolist() == [4, 5, 6]
     assert answer.quaternion.tolist() == [0.6, 0.8, 0, 0]
     assert answer.covariance is COVARIANCE
+    assert answer.is_accepted
     metres_per_deviation = np.sqrt(chi2.ppf(0.9, 3))
     assert answer.position_radius_m == pytest.approx(0.1 * metres_per_deviation, rel=0.01)
     assert answer.rotation_radius_deg == pytest.approx(np.degrees(0.02) * metres_per_deviation, rel=0.01)
@@ -31,11 +32,35 @@ def test_an_accepted_pose_of_the_map_is_the_answer():
     assert not answer.is_unfamiliar  # the map has seen that it is the place
 
 
-def test_a_pose_that_the_network_confirms_is_the_answer_with_the_networks_radii():
-    answer = combined(NETWORK, replace(found(False), is_confirmed=True))
-    assert (answer.source, answer.inliers) == ("map", 23)
-    assert answer.position_m.tolist() == [4, 5, 6]
-    assert (answer.position_radius_m, answer.rotation_radius_deg) == (0.5, 9.0)
+FAMILIAR = replace(NETWORK, unfamiliarity=0.5)
+
+
+@pytest.mark.parametrize(
+    ("network", "chance"),
+    [
+        (NETWORK, 0.0),  # the picture does not look like the place
+        (FAMILIAR, (1 - 0.1**0.16) * (1 - 0.1 ** (25 / 81))),
+        (replace(FAMILIAR, position_radius_m=0.2, rotation_radius_deg=5.0), 0.81),
+        (replace(FAMILIAR, position_radius_m=0.02, rotation_radius_deg=0.5), 1.0),
+        (replace(FAMILIAR, position_radius_m=None, rotation_radius_deg=None), 0.25),
+    ],
+    ids=["unfamiliar", "poor", "good", "excellent", "says nothing"],
+)
+def test_of_two_poses_the_likelier_is_the_answer(network, chance):
+    """Neither accepted; where the map's is chosen, the network's radii stand, and it is not called accepted."""
+    for probability in (chance - 1e-6, chance + 1e-6):
+        answer = combined(network, replace(found(False), probability=probability))
+        is_map = probability > chance
+        assert answer.source == ("map" if is_map else "network")
+        assert answer.position_m.tolist() == ([4, 5, 6] if is_map else [1, 2, 3])
+        assert (answer.position_radius_m, answer.inliers) == (network.position_radius_m, 23)
+        assert answer.covariance is None
+        assert not answer.is_accepted
+
+
+def test_what_matches_ask_of_the_focal_length_is_passed_on():
+    for is_accepted in (False, True):
+        assert combined(NETWORK, replace(found(is_accepted), focal_scale=1.1)).focal_scale == 1.1
 
 
 def test_otherwise_the_network_answers_with_its_own_radii():
@@ -47,7 +72,7 @@ def test_otherwise_the_network_answers_with_its_own_radii():
 
 def test_a_map_alone_answers_or_says_that_it_cannot():
     assert combined(None, found(True)).source == "map"
-    lost = combined(None, found(False))
+    lost = combined(None, replace(found(False), probability=0.8))
     assert (lost.source, lost.inliers, lost.position_radius_m) == (None, 23, None)
     assert np.isnan([*lost.position_m, *lost.quaternion]).all()
 

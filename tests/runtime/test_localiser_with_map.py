@@ -149,6 +149,16 @@ def test_a_wrong_camera_is_not_accepted(both, frame):
     assert both.localise(frame, wrong).source == "network"
 
 
+@pytest.mark.parametrize(("scale", "said"), [(1 / 1.1, "10 % too short"), (1.1, "10 % too long")])
+def test_a_focal_length_that_is_a_tenth_off_is_said(scale, said, map_of_den, frame):
+    """A tenth moves the pose by decimetres, which nothing else shows."""
+    wrong = np.array([[144.0 * scale, 0, 79.5], [0, 144 * scale, 59.5], [0, 0, 1]])
+    with pytest.warns(InputWarning, match=f"their focal length is about {said}"):
+        found = Localiser(map_of_den).localise(frame, wrong)
+    assert (found.source, found.covariance) == (None, None)
+    assert found.focal_scale == pytest.approx(1 / scale, abs=0.05)
+
+
 # --- bad maps ---------------------------------------------------------------------------------------------------------
 
 

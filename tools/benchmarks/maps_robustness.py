@@ -129,7 +129,7 @@ def _localise(
         if guess:
             guided, guided_s = _timed(localiser.localise, picture, intrinsics, prior)
             both = combined(guess, guided)
-            found.setdefault("both", []).append((both, both.source == "map", network_s + guided_s))
+            found.setdefault("both", []).append((both, both.is_accepted, network_s + guided_s))
     return found
 
 

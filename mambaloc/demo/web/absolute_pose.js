@@ -7,7 +7,7 @@
  */
 
 import { posesOfThree } from "./three_points.js";
-import { cross, dot, inverse, solved, unit } from "./vectors.js";
+import { cross, dot, inverse, product, solved, unit } from "./vectors.js";
 
 const TRIALS = 1000;
 const CONFIDENCE = 0.9999;
@@ -98,7 +98,7 @@ function randomNumbers(seed) {
  * @param start a pose from which the points lie in front.
  * @param {number} near a match that is off by half of it has half the weight.
  * @returns {{pose: object, covariance: number[][]|null}} of the position in metres, then of the rotation in radians
- *   about the world's axes; null where the matches leave something open.
+ *   about the world's axes: Huber's sandwich; null where the matches leave something open.
  */
 export function refinePose(start, points, rays, near) {
   let [pose, damping, now] = [start, 1e-4, normalEquations(start, points, rays, near)];
@@ -116,8 +116,33 @@ export function refinePose(start, points, rays, near) {
     [pose, damping, now] = [changed, damping / 10, next];
     if (hasConverged) break;
   }
-  const covariance = inverse(now.normal)?.map((row) => row.map((value) => value * now.spread)) ?? null;
-  return { pose, covariance };
+  return { pose, covariance: covarianceOf(pose, points, rays, near) };
+}
+
+/**
+ * How much longer than given the focal length is: a Gauss-Newton step of pose and focal length together.
+ * @returns {{scale: number, deviation: number}} the deviation is infinite where nothing says.
+ */
+export function focalScale(pose, points, rays, near) {
+  const linear = linearised(pose, points, rays, near);
+  if (!linear) return { scale: 1, deviation: Infinity };
+  const normal = Array.from({ length: 7 }, () => new Array(7).fill(0));
+  const right = new Array(7).fill(0);
+  let squares = 0;
+  for (const { off, jacobian, seen } of linear) {
+    const square = off[0] ** 2 + off[1] ** 2;
+    const weight = 1 / (1 + square);
+    squares += weight * square;
+    for (let axis = 0; axis < 2; axis++) {
+      const row = [...jacobian[axis], (seen[axis] * 2) / near];
+      addOuter(normal, row, weight);
+      row.forEach((value, i) => (right[i] -= weight * value * off[axis]));
+    }
+  }
+  const found = inverse(normal);
+  const variance = found ? (found[6][6] * squares) / Math.max(2 * linear.length - 7, 1) : 0;
+  if (!(variance > 0)) return { scale: 1, deviation: Infinity };
+  return { scale: Math.exp(found[6].reduce((sum, value, i) => sum + value * right[i], 0)), deviation: Math.sqrt(variance) };
 }
 
 /** Move a pose by metres, and turn it by radians about the world's axes. */
@@ -136,30 +161,62 @@ export function moved({ rotation, position_m }, [dx, dy, dz, ...turn]) {
   };
 }
 
-/** Cost, `J^T W J`, `-J^T W r`, and the weighted variance of the residuals `r`. */
-function normalEquations({ rotation: r, position_m: [px, py, pz] }, points, rays, near) {
-  const normal = Array.from({ length: 6 }, () => new Array(6).fill(0));
-  const right = new Array(6).fill(0);
-  let [cost, squares] = [0, 0];
+/** Each match's residual in halves of `near`, its slopes, and where its point is seen; null where one is not in front. */
+function linearised({ rotation: r, position_m: [px, py, pz] }, points, rays, near) {
+  const linear = [];
   for (let i = 0, j = 0; i < rays.length; i += 2, j += 3) {
     const towards = [points[j] - px, points[j + 1] - py, points[j + 2] - pz];
     const [x, y, depth] = [0, 1, 2].map((axis) => dot([r[axis], r[3 + axis], r[6 + axis]], towards));
-    if (depth <= LEAST_DEPTH) return { cost: Infinity, normal, right, spread: Infinity };
+    if (depth <= LEAST_DEPTH) return null;
     const seen = [x / depth, y / depth];
     const off = seen.map((value, axis) => ((value - rays[i + axis]) * 2) / near);
-    const square = off[0] ** 2 + off[1] ** 2;
-    const weight = 1 / (1 + square);
-    cost += Math.log1p(square);
-    squares += weight * square;
-    for (let axis = 0; axis < 2; axis++) {
+    const jacobian = [0, 1].map((axis) => {
       // d off / d point; a turn about the world's axes moves a point by towards x turn.
       const slope = [0, 3, 6].map((row) => ((r[row + axis] - seen[axis] * r[row + 2]) * 2) / near / depth);
-      const jacobian = [-slope[0], -slope[1], -slope[2], ...cross(slope, towards)];
-      for (let row = 0; row < 6; row++) {
-        right[row] -= weight * jacobian[row] * off[axis];
-        for (let column = 0; column < 6; column++) normal[row][column] += weight * jacobian[row] * jacobian[column];
-      }
+      return [-slope[0], -slope[1], -slope[2], ...cross(slope, towards)];
+    });
+    linear.push({ off, jacobian, seen });
+  }
+  return linear;
+}
+
+/** Cost, `J^T W J` and `-J^T W r` of residuals `r`. */
+function normalEquations(pose, points, rays, near) {
+  const normal = Array.from({ length: 6 }, () => new Array(6).fill(0));
+  const right = new Array(6).fill(0);
+  const linear = linearised(pose, points, rays, near);
+  if (!linear) return { cost: Infinity, normal, right };
+  let cost = 0;
+  for (const { off, jacobian } of linear) {
+    const square = off[0] ** 2 + off[1] ** 2;
+    cost += Math.log1p(square);
+    for (let axis = 0; axis < 2; axis++) {
+      addOuter(normal, jacobian[axis], 1 / (1 + square));
+      jacobian[axis].forEach((value, i) => (right[i] -= (value * off[axis]) / (1 + square)));
     }
   }
-  return { cost, normal, right, spread: squares / Math.max(rays.length - 6, 1) };
+  return { cost, normal, right };
+}
+
+/** `H^-1 (sum of g g^T) H^-1` of the cost's Hessian and each match's gradient; null where `H` is singular. */
+function covarianceOf(pose, points, rays, near) {
+  const linear = linearised(pose, points, rays, near);
+  if (!linear) return null;
+  const [hessian, squares] = [0, 1].map(() => Array.from({ length: 6 }, () => new Array(6).fill(0)));
+  for (const { off, jacobian } of linear) {
+    const weight = 1 / (1 + off[0] ** 2 + off[1] ** 2);
+    const gradient = jacobian[0].map((value, i) => weight * (value * off[0] + jacobian[1][i] * off[1]));
+    for (const row of jacobian) addOuter(hessian, row, weight);
+    addOuter(hessian, gradient, -2);
+    addOuter(squares, gradient, (2 * linear.length) / Math.max(2 * linear.length - 6, 1));
+  }
+  const found = inverse(hessian);
+  return found && product(product(found, squares), found);
+}
+
+/** Add the outer product of a row with itself, times a weight. */
+function addOuter(matrix, row, weight) {
+  for (let i = 0; i < row.length; i++) {
+    for (let j = 0; j < row.length; j++) matrix[i][j] += weight * row[i] * row[j];
+  }
 }

@@ -8,6 +8,8 @@ import { Network } from "./network.js";
 
 const CONTRACT_VERSION = 1;
 const MODELS = ["model.onnx", "model.fp16.onnx", "model.int8.onnx", "model.ort"];
+const UNSTATED = 0.25; // probability that a network's pose is right which says nothing
+const RIGHT = { m: 0.2, deg: 5 };
 const LEVEL_SIGMAS = 1.2815515655446004; // nine tenths of a normal variable are below
 
 /** A network, and a map. */
@@ -34,7 +36,8 @@ export class Localiser {
   }
 
   /**
-   * Localise one picture: the map's pose where it is accepted or the network confirms it, the network's otherwise.
+   * Localise one picture: the map's pose where it is accepted or likelier to be right than the network's, which is
+   * the answer otherwise.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels, for the map; the map's camera unless given.
    * @returns as {@link Network#localise}; and `source`, "map" or "network"; `network`, its own answer; where there is a
@@ -46,13 +49,22 @@ export class Localiser {
     const start = performance.now();
     const map = this.#map.localise(image, intrinsics, network);
     const both = { ...network, source: "network", network, map, map_ms: performance.now() - start };
-    if (!map?.isAccepted && !map?.isConfirmed) return both;
+    if (!map?.isAccepted && !(map?.probability > probabilityOf(network))) return both;
     const { position_m, quaternion_wxyz } = map;
     const answer = { ...both, source: "map", position_m, quaternion_wxyz };
     if (!map.isAccepted) return answer;
     const [position, rotation] = [0, 3].map((from) => covarianceRadius(map.covariance, from));
     return { ...answer, position_radius_m: position, rotation_radius_deg: (rotation * 180) / Math.PI };
   }
+}
+
+/** That a network's pose is right, as `mambaloc/runtime/localisation.py` has it. */
+function probabilityOf({ position_radius_m, rotation_radius_deg, unfamiliarity }) {
+  if (unfamiliarity !== undefined && !(unfamiliarity <= 1)) return 0;
+  if (position_radius_m === undefined || rotation_radius_deg === undefined) return UNSTATED;
+  // Nine tenths of errors are within a radius; within so many radii are these, if errors are Rayleigh's.
+  const radii = [RIGHT.m / position_radius_m, RIGHT.deg / rotation_radius_deg];
+  return radii.reduce((share, each) => share * (1 - 0.1 ** (each * each)), 1);
 }
 
 /**

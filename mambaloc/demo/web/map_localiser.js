@@ -1,10 +1,11 @@
 /** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localiser.py` finds it. No DOM. */
 
-import { project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
+import { focalScale, project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
+import { LEAST_PROBABILITY, isAnotherFocalLength, occupiedCells, probabilityOf } from "./acceptance.js";
 import { LENGTH } from "./descriptors.js";
 import { Drift } from "./drift.js";
 import { matrixOf, median, quaternionOf } from "./geometry.js";
-import { Matcher, matchNearby } from "./matching.js";
+import { Matcher, distinctiveOf, matchNearby } from "./matching.js";
 import { greyPicture } from "./pictures.js";
 import { detectFeatures } from "./sift.js";
 import { cameraOf } from "./sparse_map.js";
@@ -18,8 +19,6 @@ const NEAREST = 8; // key frames whose points are searched again
 const WINDOWS = [6, 2]; // radii of the guided rounds, in times of what is near
 const PRIOR_WINDOW = 12; // likewise, around a prior
 const LEAST_SHARE = 0.1;
-const MOST_DEVIATION = 0.04; // of the key frames' spread
-const CONFIRMED = { inliers: 8, deviation: 0.06, move: 0.5, turn_deg: 15 }; // lengths of the key frames' spread
 const LENS_STEPS = 10;
 const SAME = 0.01; // of the width, by which a camera may differ from the map's and still be its own
 
@@ -52,8 +51,8 @@ export class MapLocaliser {
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the map's camera unless given.
    * @param prior a pose to search around where all points at once find none to accept.
-   * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `isConfirmed`, `covariance` as in
-   *   Python, and `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers.
+   * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `covariance`, `probability` and
+   *   `focalScale` as in Python, and `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers.
    *   Null where there is no pose, or the picture has another shape than the map's, so that its camera is unknown.
    */
   localise(image, intrinsics = null, prior = null) {
@@ -69,8 +68,7 @@ export class MapLocaliser {
     const matches = this.#search(features, this.#drift?.toAdjusted(around) ?? around, PRIOR_WINDOW * near);
     const guided = ransacPose(...this.#matched(features, matches), near, this.#seed);
     const both = [found, this.#settled(features, grey, guided)].filter(Boolean);
-    for (const each of both) each.isConfirmed = isConfirmed(each, prior, this.#unit_m);
-    const rank = (each) => 1e6 * each.isAccepted + 1e5 * each.isConfirmed + each.inliers;
+    const rank = (each) => 1e6 * each.isAccepted + 1e5 * each.probability + 1e-6 * each.inliers;
     return both.reduce((best, each) => (best && rank(best) >= rank(each) ? best : each), null);
   }
 
@@ -79,33 +77,51 @@ export class MapLocaliser {
     if (!start) return null;
     const near = this.#near;
     let [pose, scale] = [start, near / 2]; // of the refinement; finer where the matches are
-    let [matches, covariance, off] = [null, null, null];
+    let matches, covariance, off, seen_m, rays, finest;
     for (const window of WINDOWS) {
       matches = this.#search(features, pose, window * near);
       if (matches.points.length < 4) return null;
-      const [seen_m, rays] = this.#matched(features, matches);
-      ({ pose, covariance } = refinePose(pose, seen_m, rays, scale));
+      [seen_m, rays] = this.#matched(features, matches);
+      finest = scale;
+      ({ pose, covariance } = refinePose(pose, seen_m, rays, finest));
       off = residuals(pose, seen_m, rays);
       scale = Math.min(near / 2, Math.max(2.5 * median(off.filter(Number.isFinite)), LEAST_SHARE * near));
     }
+    const shown = matches.keypoints.map((row, i) => ({
+      point: matches.points[i],
+      x: (features.pixels[2 * row] + 0.5) / grey.width,
+      y: (features.pixels[2 * row + 1] + 0.5) / grey.height,
+      off: off[i] / near,
+    }));
     const inliers = off.filter((each) => each <= near).length;
-    const isFixed = deviationOf(covariance) <= MOST_DEVIATION * this.#unit_m;
+    const focal = focalScale(pose, seen_m, rays, finest);
+    const focalOff = isAnotherFocalLength(focal) ? focal.scale : null;
+    const probability = focalOff === null ? this.#probability(features, start, pose, matches, shown, finest) : 0;
     const carried = this.#drift?.toGiven(pose);
     const { position_m, rotation } = carried?.pose ?? pose;
     return {
       position_m,
       quaternion_wxyz: quaternionOf(rotation),
       inliers,
-      isAccepted: isFixed && inliers >= this.#map.about.least_inliers,
-      isConfirmed: false,
+      isAccepted: probability >= LEAST_PROBABILITY && inliers >= this.#map.about.least_inliers,
       covariance: covariance?.map((row, i) => row.map((value, j) => value + (carried?.unsure[i][j] ?? 0))),
-      matches: matches.keypoints.map((row, i) => ({
-        point: matches.points[i],
-        x: (features.pixels[2 * row] + 0.5) / grey.width,
-        y: (features.pixels[2 * row + 1] + 0.5) / grey.height,
-        off: off[i] / near,
-      })),
+      probability,
+      focalScale: focalOff,
+      matches: shown,
     };
+  }
+
+  /** That a pose is right, by its distinctive matches. */
+  #probability(features, start, pose, matches, shown, scale) {
+    const rows = distinctiveOf(features, matches, this.#map.descriptors);
+    let deviation = Infinity;
+    if (rows.length >= 4) {
+      const [keypoints, points] = [matches.keypoints, matches.points].map((all) => rows.map((i) => all[i]));
+      const { covariance } = refinePose(pose, ...this.#matched(features, { keypoints, points }), scale);
+      if (covariance) deviation = Math.sqrt(largestEigenvalue(covariance)) / this.#unit_m;
+    }
+    const cells = occupiedCells(rows.map((i) => shown[i]).filter(({ off }) => off <= 1));
+    return probabilityOf(cells, deviation, turnBetween(start.rotation, pose.rotation));
   }
 
   /** Match again what a pose projects within a radius of a keypoint. */
@@ -157,18 +173,10 @@ export class MapLocaliser {
   }
 }
 
-/** The deviation of the position in metres, in the direction that is least sure. */
-function deviationOf(covariance) {
-  return covariance ? Math.sqrt(largestEigenvalue(covariance)) : Infinity;
-}
-
-/** Whether a prior is near a pose that has a few matches. */
-function isConfirmed({ position_m, quaternion_wxyz, inliers, covariance }, prior, unit_m) {
-  const isFixed = deviationOf(covariance) <= CONFIRMED.deviation * unit_m && inliers >= CONFIRMED.inliers;
-  const move = Math.hypot(...position_m.map((value, i) => value - prior.position_m[i])) / unit_m;
-  const cosine = Math.abs(quaternion_wxyz.reduce((sum, value, i) => sum + value * prior.quaternion_wxyz[i], 0));
-  const turn_deg = (2 * Math.acos(Math.min(1, cosine)) * 180) / Math.PI;
-  return isFixed && move <= CONFIRMED.move && turn_deg <= CONFIRMED.turn_deg;
+/** Degrees from one rotation, nine numbers row by row, to another. */
+function turnBetween(a, b) {
+  const square = a.reduce((sum, value, i) => sum + (value - b[i]) ** 2, 0); // 8 sin^2 of half the angle
+  return (2 * Math.asin(Math.min(1, Math.sqrt(square / 8))) * 180) / Math.PI;
 }
 
 /** A camera's intrinsics once a picture is resized; corners stay corners. */

@@ -72,9 +72,10 @@ export class Matcher {
  * @param {Float64Array} projected where every point of the map is, x, y in the plane at depth 1.
  * @param {Float32Array} descriptors of every point.
  * @param {{radius: number, ratio: number, farthest: number}} limits in that plane, of both distances, and of the first.
+ * @returns {{keypoints: number[], points: number[], visible: number[]}}
  */
 export function matchNearby(features, visible, projected, descriptors, { radius, ratio, farthest }) {
-  const matches = { keypoints: [], points: [] };
+  const matches = { keypoints: [], points: [], visible };
   if (visible.length < 2) return matches;
   const nearest = new Map(); // of each point, its keypoint and their similarity
   const found = [];
@@ -102,6 +103,20 @@ export function matchNearby(features, visible, projected, descriptors, { radius,
     matches.points.push(point);
   }
   return matches;
+}
+
+/**
+ * Rows of matches that are distinctive: no point in view is more similar to the keypoint than its own.
+ * @param features of the picture.
+ * @param {{keypoints: number[], points: number[], visible: number[]}} matches of {@link matchNearby}.
+ * @param {Float32Array} descriptors of every point.
+ */
+export function distinctiveOf(features, { keypoints, points, visible }, descriptors) {
+  const alike = (row, point) => product(features.descriptors, keypoints[row], descriptors, point, LENGTH);
+  return [...keypoints.keys()].filter((row) => {
+    const own = alike(row, points[row]);
+    return visible.every((point) => alike(row, point) <= own);
+  });
 }
 
 /** Euclidean distance of unit descriptors from their product. */

@@ -2,7 +2,7 @@
 //
 //   mambaloc::MapLocaliser localiser(bytes);                   // of the file; throws std::exception
 //   auto found = localiser.localise(rgb, intrinsics, &prior);  // prior: the network's pose, or nullptr
-//   if (found.accepted || found.confirmed) use(found); else use(network);
+//   if (found.accepted || found.probability > 0.25) use(found); else use(network);  // 0.25: that the network is right
 //
 // Poses are world_from_cam: metres; OpenCV camera axes (x right, y down, z forward). One object serves any thread.
 // Each step is that of mambaloc/runtime/maps in Python; INTEGRATION.md says how to check it with the bundle's frames.
@@ -15,6 +15,7 @@
 #include <cstring>
 #include <limits>
 #include <numeric>
+#include <set>
 #include <stdexcept>
 #include <string>
 #include <tuple>
@@ -41,7 +42,8 @@ struct MapLocalisation {
   CameraPose pose;
   int inliers = 0;
   bool accepted = false;
-  bool confirmed = false;  // by a prior that is near
+  double probability = 0;  // that it is within 0.2 m and 5 degrees; it is accepted from 0.92 on
+  double focal_scale = 1;  // times the given focal length, where matches contradict that; the probability is 0 then
   // Position in metres, then rotation in radians about the world's axes: the order and frame of ROS.
   cv::Matx66d covariance;
 };
@@ -60,20 +62,15 @@ class MapLocaliser {
     if (!prior || found.accepted) return found;
     points.clear(), rays.clear();
     search(seen, carried(*prior, -1).first, 12.0 * near_, points, rays);
-    MapLocalisation both[] = {found, settled(seen, points, rays)};
-    for (auto& each : both) {
-      const double move = cv::norm(each.pose.position_m - prior->position_m) / unit_m_;
-      cv::Vec3d turn;
-      cv::Rodrigues(each.pose.rotation.t() * prior->rotation, turn);
-      each.confirmed = each.inliers >= 8 && deviation(each) <= 0.06 * unit_m_ && move <= 0.5 && cv::norm(turn) * 180 / CV_PI <= 15.0;
-    }
-    const auto rank = [](const MapLocalisation& each) { return std::make_tuple(each.accepted, each.confirmed, each.inliers); };
-    return rank(both[1]) > rank(both[0]) ? both[1] : both[0];
+    const MapLocalisation guided = settled(seen, points, rays);
+    const auto rank = [](const MapLocalisation& each) { return std::make_tuple(each.accepted, each.probability, each.inliers); };
+    return rank(guided) > rank(found) ? guided : found;
   }
 
   // For a bridge to another language: height x width x 3 bytes, R G B; fx, fy, cx, cy in its pixels, or nullptr for the
   // map's own camera; the network's pose as x y z qw qx qy qz, or nullptr. Returns the same 7 numbers, the inliers, and
-  // the covariance's 36; nothing where no pose is accepted or confirmed, or the map's own camera does not have the picture's shape.
+  // the covariance's 36; nothing where no pose is accepted, nor likelier to be right than the prior's, taken for 0.25; nor where the
+  // map's own camera does not have the picture's shape.
   std::vector<double> localise(const uint8_t* rgb, int height, int width, const double* camera, const double* prior) const {
     if (!camera && std::abs(width * size_.height - height * size_.width) > std::max(size_.width, size_.height)) return {};
     const cv::Matx33d k = camera ? cv::Matx33d(camera[0], 0, camera[2], 0, camera[1], camera[3], 0, 0, 1)
@@ -88,7 +85,7 @@ class MapLocaliser {
     }
     const cv::Mat picture(height, width, CV_8UC3, const_cast<uint8_t*>(rgb));
     const MapLocalisation found = localise(picture, k, prior ? &around : nullptr);
-    if (!found.accepted && !found.confirmed) return {};
+    if (!found.accepted && !(prior && found.probability > 0.25)) return {};
     cv::Vec3d turn;
     cv::Rodrigues(found.pose.rotation, turn);
     const double angle = cv::norm(turn), share = angle > 1e-12 ? std::sin(angle / 2) / angle : 0.5;
@@ -100,8 +97,9 @@ class MapLocaliser {
 
  private:
   struct Features {
-    std::vector<cv::Vec2d> rays;  // where keypoints lie in the plane at depth 1
-    cv::Mat descriptors;          // (N, 128) float, unit length
+    std::vector<cv::Vec2d> rays;    // where keypoints lie in the plane at depth 1
+    std::vector<cv::Vec2d> shares;  // and in the picture, whose corners are (0, 0) and (1, 1)
+    cv::Mat descriptors;            // (N, 128) float, unit length
     cv::Vec2d upper_left, lower_right;
   };
 
@@ -148,6 +146,7 @@ class MapLocaliser {
     for (const auto& each : keypoints) {
       const cv::Vec2d ray = normalised(small, each.pt.x, each.pt.y);
       seen.rays.push_back(is_own ? undistorted(ray) : ray);
+      seen.shares.emplace_back((each.pt.x + 0.5) / size.width, (each.pt.y + 0.5) / size.height);
     }
     seen.upper_left = normalised(small, -0.5, -0.5);
     seen.lower_right = normalised(small, size.width - 0.5, size.height - 0.5);
@@ -178,9 +177,9 @@ class MapLocaliser {
   }
 
   // Of the position, in the direction that is least sure.
-  static double deviation(const MapLocalisation& found) {
+  static double deviation(const cv::Matx66d& covariance) {
     cv::Vec3d variances;
-    cv::eigen(found.covariance.get_minor<3, 3>(0, 0), variances);  // the largest first
+    cv::eigen(covariance.get_minor<3, 3>(0, 0), variances);  // the largest first
     return std::sqrt(variances[0]);
   }
 
@@ -192,19 +191,29 @@ class MapLocaliser {
       if (best[i] >= 0) points.push_back(points_[often_[best[i]]]), rays.push_back(seen.rays[i]);
   }
 
+  struct Sight {
+    int keypoint;
+    bool is_distinctive;  // the point is the most similar of all points in view
+  };
+
   // RANSAC; then search around the pose and refine it, twice.
   MapLocalisation settled(const Features& seen, const std::vector<cv::Vec3d>& matched, const std::vector<cv::Vec2d>& at) const {
     MapLocalisation answer;
-    CameraPose pose;
-    if (!ransac(matched, at, pose)) return answer;
+    CameraPose start;
+    if (!ransac(matched, at, start)) return answer;
+    CameraPose pose = start;
+    double finest = 0;
+    std::vector<cv::Vec3d> points;
+    std::vector<cv::Vec2d> rays;
+    std::vector<Sight> sights;
     double scale = near_ / 2;
     std::vector<double> off;
     for (double window : {6.0, 2.0}) {
-      std::vector<cv::Vec3d> points;
-      std::vector<cv::Vec2d> rays;
-      search(seen, pose, window * near_, points, rays);
+      points.clear(), rays.clear(), sights.clear();
+      search(seen, pose, window * near_, points, rays, &sights);
       if (points.size() < 4) return MapLocalisation();
-      answer.covariance = refine(pose, points, rays, scale);
+      finest = scale;
+      answer.covariance = refine(pose, points, rays, finest);
       off.clear();
       for (size_t i = 0; i < points.size(); ++i) off.push_back(cv::norm(project(pose, points[i]) - rays[i]));
       std::vector<double> sorted = off;
@@ -213,7 +222,30 @@ class MapLocaliser {
       scale = std::min(near_ / 2, std::max(2.5 * median, 0.1 * near_));
     }
     answer.inliers = int(std::count_if(off.begin(), off.end(), [&](double each) { return each <= near_; }));
-    answer.accepted = answer.inliers >= least_inliers_ && deviation(answer) <= 0.04 * unit_m_;
+    const auto [focal, focal_deviation] = focal_scale(pose, points, rays, finest);
+    const bool is_another = std::abs(std::log(focal)) > std::max(0.03, 3.0 * focal_deviation);
+    if (is_another) answer.focal_scale = focal;
+    if (!is_another) {
+      std::vector<cv::Vec3d> theirs;
+      std::vector<cv::Vec2d> where;
+      std::set<std::pair<int, int>> cells;  // of a grid of 4 x 4
+      for (size_t i = 0; i < points.size(); ++i) {
+        if (!sights[i].is_distinctive) continue;
+        theirs.push_back(points[i]), where.push_back(rays[i]);
+        const cv::Vec2d share = seen.shares[sights[i].keypoint];
+        if (off[i] <= near_) cells.insert({int(std::floor(4 * share[0])), int(std::floor(4 * share[1]))});
+      }
+      if (theirs.size() >= 4) {
+        CameraPose again = pose;
+        const double share = deviation(refine(again, theirs, where, finest)) / unit_m_;
+        cv::Vec3d turn;
+        cv::Rodrigues(start.rotation.t() * pose.rotation, turn);
+        const double evidence = -5.0 + 3.29 * std::log(double(cells.size()) + 0.5) - 0.45 * std::log(std::max(share, 1e-3)) -
+                                0.91 * std::log(cv::norm(turn) * 180 / CV_PI + 0.1);
+        answer.probability = std::isfinite(share) ? 1 / (1 + std::exp(-evidence)) : 0;
+      }
+    }
+    answer.accepted = answer.probability >= 0.92 && answer.inliers >= least_inliers_;
     const auto [given, unsure] = carried(pose, 1);
     answer.pose = given;
     answer.covariance += unsure;
@@ -239,7 +271,7 @@ class MapLocaliser {
 
   // Match again what the pose projects near a keypoint, of the points that one of the 8 nearest key frames sees.
   void search(const Features& seen, const CameraPose& pose, double radius, std::vector<cv::Vec3d>& points,
-              std::vector<cv::Vec2d>& rays) const {
+              std::vector<cv::Vec2d>& rays, std::vector<Sight>* sights = nullptr) const {
     const Place here = place(pose, unit_m_);
     std::vector<int> order(places_.size());
     std::iota(order.begin(), order.end(), 0);
@@ -260,6 +292,11 @@ class MapLocaliser {
     }
     if (visible.empty() || seen.rays.empty()) return;
     cv::Mat similarity = seen.descriptors * theirs.t();
+    std::vector<float> most;
+    for (int i = 0; i < similarity.rows; ++i) {
+      const float* row = similarity.ptr<float>(i);
+      most.push_back(*std::max_element(row, row + similarity.cols));
+    }
     for (int i = 0; i < similarity.rows; ++i)
       for (int j = 0; j < similarity.cols; ++j)
         if (cv::norm(seen.rays[i] - projected[j]) > radius) similarity.at<float>(i, j) = -1;
@@ -270,52 +307,108 @@ class MapLocaliser {
       bool is_mutual = true;
       for (int other = 0; other < similarity.rows; ++other)
         is_mutual &= similarity.at<float>(other, j) <= similarity.at<float>(i, j);
-      if (is_mutual) points.push_back(points_[visible[j]]), rays.push_back(seen.rays[i]);
+      if (!is_mutual) continue;
+      points.push_back(points_[visible[j]]), rays.push_back(seen.rays[i]);
+      if (sights) sights->push_back({i, similarity.at<float>(i, j) >= most[i]});
     }
   }
 
+  struct Linear {
+    cv::Vec2d off, seen;          // the residual in halves of near; where the point is seen
+    cv::Vec<double, 6> row[2];    // slopes of the residual
+    double square() const { return off.dot(off); }
+    double weight() const { return 1 / (1 + square()); }  // Cauchy's
+  };
+
+  // Empty where a point lies behind the camera.
+  static std::vector<Linear> linearised(const CameraPose& pose, const std::vector<cv::Vec3d>& points,
+                                        const std::vector<cv::Vec2d>& rays, double near) {
+    std::vector<Linear> all;
+    for (size_t i = 0; i < points.size(); ++i) {
+      const cv::Vec3d towards = points[i] - pose.position_m, cam = pose.rotation.t() * towards;
+      if (cam[2] <= 1e-9) return {};
+      Linear one;
+      one.seen = {cam[0] / cam[2], cam[1] / cam[2]};
+      one.off = (one.seen - rays[i]) * (2 / near);
+      for (int axis = 0; axis < 2; ++axis) {
+        cv::Vec3d slope;
+        for (int c = 0; c < 3; ++c) slope[c] = (pose.rotation(c, axis) - one.seen[axis] * pose.rotation(c, 2)) * 2 / near / cam[2];
+        const cv::Vec3d by_turn = slope.cross(towards);
+        one.row[axis] = {-slope[0], -slope[1], -slope[2], by_turn[0], by_turn[1], by_turn[2]};
+      }
+      all.push_back(one);
+    }
+    return all;
+  }
+
   struct Equations {
-    double cost = 0, spread = 0;
-    cv::Matx66d normal = cv::Matx66d::zeros();
+    double cost = std::numeric_limits<double>::infinity();
+    cv::Matx66d normal = cv::Matx66d::eye();
     cv::Vec<double, 6> right = {};
   };
 
-  static Equations equations(const CameraPose& pose, const std::vector<cv::Vec3d>& points, const std::vector<cv::Vec2d>& rays,
-                             double near) {
+  static Equations equations(const std::vector<Linear>& all) {
     Equations sum;
-    for (size_t i = 0; i < points.size(); ++i) {
-      const cv::Vec3d towards = points[i] - pose.position_m, cam = pose.rotation.t() * towards;
-      if (cam[2] <= 1e-9) {
-        sum.cost = std::numeric_limits<double>::infinity();
-        return sum;
-      }
-      const cv::Vec2d ray(cam[0] / cam[2], cam[1] / cam[2]), off = (ray - rays[i]) * (2 / near);
-      const double square = off.dot(off), weight = 1 / (1 + square);  // Cauchy's
+    if (all.empty()) return sum;
+    sum.cost = 0, sum.normal = cv::Matx66d::zeros();
+    for (const Linear& one : all) {
+      sum.cost += std::log1p(one.square());
       for (int axis = 0; axis < 2; ++axis) {
-        cv::Vec3d slope;
-        for (int c = 0; c < 3; ++c) slope[c] = (pose.rotation(c, axis) - ray[axis] * pose.rotation(c, 2)) * 2 / near / cam[2];
-        const cv::Vec3d by_turn = slope.cross(towards);
-        const cv::Vec<double, 6> row(-slope[0], -slope[1], -slope[2], by_turn[0], by_turn[1], by_turn[2]);
-        sum.normal += weight * (row * row.t());
-        sum.right -= weight * off[axis] * row;
+        sum.normal += one.weight() * (one.row[axis] * one.row[axis].t());
+        sum.right -= one.weight() * one.off[axis] * one.row[axis];
       }
-      sum.cost += std::log1p(square);
-      sum.spread += weight * square;
     }
-    sum.spread /= std::max(2 * double(points.size()) - 6, 1.0);
     return sum;
+  }
+
+  // Huber's sandwich: the cost's Hessian, and each match's gradient.
+  static cv::Matx66d sandwich(const std::vector<Linear>& all) {
+    cv::Matx66d hessian = cv::Matx66d::zeros(), squares = cv::Matx66d::zeros();
+    for (const Linear& one : all) {
+      const cv::Vec<double, 6> gradient = one.weight() * (one.off[0] * one.row[0] + one.off[1] * one.row[1]);
+      for (const auto& row : one.row) hessian += one.weight() * (row * row.t());
+      hessian -= 2 * (gradient * gradient.t());
+      squares += gradient * gradient.t();
+    }
+    const double freedom = 2 * double(all.size()) / std::max(2 * double(all.size()) - 6, 1.0);
+    const cv::Matx66d inverse = hessian.inv(cv::DECOMP_SVD);
+    return freedom * (inverse * squares * inverse);
+  }
+
+  // How much longer than given the focal length is, and its deviation: a step of pose and focal length together.
+  static std::pair<double, double> focal_scale(const CameraPose& pose, const std::vector<cv::Vec3d>& points,
+                                               const std::vector<cv::Vec2d>& rays, double near) {
+    using Row = cv::Vec<double, 7>;
+    cv::Matx<double, 7, 7> normal = cv::Matx<double, 7, 7>::zeros();
+    Row right = Row::all(0);
+    double squares = 0;
+    const std::vector<Linear> all = linearised(pose, points, rays, near);
+    for (const Linear& one : all) {
+      squares += one.weight() * one.square();
+      for (int axis = 0; axis < 2; ++axis) {
+        Row row;
+        for (int c = 0; c < 6; ++c) row[c] = one.row[axis][c];
+        row[6] = one.seen[axis] * 2 / near;
+        normal += one.weight() * (row * row.t());
+        right -= one.weight() * one.off[axis] * row;
+      }
+    }
+    const cv::Matx<double, 7, 7> inverse = normal.inv(cv::DECOMP_SVD);
+    const double variance = inverse(6, 6) * squares / std::max(2 * double(all.size()) - 7, 1.0);
+    if (!(variance > 0)) return {1, std::numeric_limits<double>::infinity()};
+    return {std::exp((inverse * right)[6]), std::sqrt(variance)};
   }
 
   // Levenberg-Marquardt with Cauchy's weights; returns the covariance.
   static cv::Matx66d refine(CameraPose& pose, const std::vector<cv::Vec3d>& points, const std::vector<cv::Vec2d>& rays, double near) {
     double damping = 1e-4;
-    Equations now = equations(pose, points, rays, near);
+    Equations now = equations(linearised(pose, points, rays, near));
     for (int i = 0; i < 10; ++i) {
       cv::Matx66d damped = now.normal + 1e-12 * cv::Matx66d::eye();
       for (int d = 0; d < 6; ++d) damped(d, d) += damping * now.normal(d, d);
       const cv::Vec<double, 6> step = damped.solve(now.right, cv::DECOMP_LU);
       const CameraPose moved{turned({step[3], step[4], step[5]}) * pose.rotation, pose.position_m + cv::Vec3d(step[0], step[1], step[2])};
-      const Equations next = equations(moved, points, rays, near);
+      const Equations next = equations(linearised(moved, points, rays, near));
       if (next.cost <= now.cost) {
         const bool has_converged = now.cost - next.cost <= 1e-6 * now.cost;
         pose = moved, damping /= 10, now = next;
@@ -324,7 +417,7 @@ class MapLocaliser {
         damping *= 10;
       }
     }
-    return now.normal.inv(cv::DECOMP_SVD) * now.spread;
+    return sandwich(linearised(pose, points, rays, near));
   }
 
   using Place = cv::Vec<double, 6>;  // a move by the key frames' spread counts as much as a turn by 25 degrees

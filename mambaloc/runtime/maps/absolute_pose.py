@@ -78,47 +78,95 @@ def refine_pose(start: CameraPose, points_m: Floats, rays: Floats, near: float) 
 
     Returns:
         The pose, and its covariance (6, 6): of the position in metres, then of the rotation in radians about the fixed
-        axes of the world (``R = exp(θ) R_estimated``), as ROS's PoseWithCovariance has it. It is the inverse of the
-        normal equations times the weighted variance of the residuals.
+        axes of the world (``R = exp(θ) R_estimated``), as ROS's PoseWithCovariance has it; all infinite where a point
+        lies behind the camera. It is the sandwich of an M-estimator, ``H^-1 (Σ g g^T) H^-1`` of the cost's Hessian and
+        each match's gradient (Huber 1967): Cauchy's weights are no variances, so the inverse of the normal equations
+        is too small where residuals are as large as their scale.
     """
     pose, damping = start, 1e-4
-    cost, normal, right, spread = _normal_equations(pose, points_m, rays, near)
+    cost, normal, right = _normal_equations(pose, points_m, rays, near)
     for _ in range(_STEPS):
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6), right)
         moved = _moved(pose, step)
         new = _normal_equations(moved, points_m, rays, near)
         if new[0] <= cost:
             has_converged = cost - new[0] <= 1e-6 * cost
-            pose, damping, (cost, normal, right, spread) = moved, damping / 10, new
+            pose, damping, (cost, normal, right) = moved, damping / 10, new
             if has_converged:
                 break
         else:
             damping *= 10
-    return pose, np.linalg.pinv(normal, hermitian=True) * spread
+    return pose, _covariance(pose, points_m, rays, near)
+
+
+def focal_scale(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[float, float]:
+    """How much longer than given the focal length is: a Gauss-Newton step of pose and focal length together.
+
+    Args:
+        pose: of :func:`refine_pose`, with the same points, rays and ``near``.
+        points_m: (M, 3), M of 4 or more.
+        rays: (M, 2) in the plane at depth 1.
+        near: as there.
+
+    Returns:
+        The scale, 1 where the intrinsics fit, and its standard deviation, which is infinite where nothing says.
+    """
+    linear = _linearised(pose, points_m, rays, near)
+    if linear is None:
+        return 1.0, np.inf
+    off, jacobian, seen = linear
+    jacobian = np.concatenate((jacobian, (seen * (2 / near))[..., None]), axis=2).reshape(-1, 7)
+    square = (off**2).sum(axis=1)
+    weight = 1 / (1 + square)
+    weighted = (jacobian * np.repeat(weight, 2)[:, None]).T
+    inverse = np.linalg.pinv(weighted @ jacobian, hermitian=True)
+    variance = inverse[6, 6] * float(weight @ square) / max(2 * len(off) - 7, 1)
+    return float(np.exp(-inverse[6] @ weighted @ off.ravel())), float(np.sqrt(variance)) if variance > 0 else np.inf
 
 
 def _moved(pose: CameraPose, step: Floats) -> CameraPose:
     return CameraPose(cv2.Rodrigues(step[3:])[0] @ pose.rotation, pose.position_m + step[:3])
 
 
-def _normal_equations(
-    pose: CameraPose, points_m: Floats, rays: Floats, near: float
-) -> tuple[float, Floats, Floats, float]:
-    """Cost, ``J^T W J`` (6, 6), ``-J^T W r`` (6,), and the weighted variance of the residuals."""
+def _linearised(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[Floats, Floats, Floats] | None:
+    """Residuals in halves of ``near`` (M, 2), their slopes (M, 2, 6), and where points are seen (M, 2).
+
+    None where a point lies behind the camera.
+    """
     towards = points_m - pose.position_m
     cam = towards @ pose.rotation
     if (cam[:, 2] <= 1e-9).any():
-        return np.inf, np.eye(6), np.zeros(6), np.inf
+        return None
     seen = cam[:, :2] / cam[:, 2:]
-    off = (seen - rays) * (2 / near)
-    square = (off**2).sum(axis=1)
-    weight = 1 / (1 + square)
     # d seen / d cam, carried into the world; a turn by θ about the world's axes moves a point by -θ x towards.
     slope = (pose.rotation.T[:2] - seen[..., None] * pose.rotation.T[2]) * (2 / near / cam[:, 2])[:, None, None]
-    jacobian = np.concatenate((-slope, slope @ (towards @ _CROSS).reshape(-1, 3, 3)), axis=-1).reshape(-1, 6)
-    weighted = (jacobian * np.repeat(weight, 2)[:, None]).T
-    spread = float(weight @ square) / max(2 * len(off) - 6, 1)
-    return float(np.log1p(square).sum()), weighted @ jacobian, -weighted @ off.ravel(), spread
+    jacobian = np.concatenate((-slope, slope @ (towards @ _CROSS).reshape(-1, 3, 3)), axis=-1)
+    return (seen - rays) * (2 / near), jacobian, seen
+
+
+def _normal_equations(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[float, Floats, Floats]:
+    """Cost, ``J^T W J`` (6, 6) and ``-J^T W r`` (6,)."""
+    linear = _linearised(pose, points_m, rays, near)
+    if linear is None:
+        return np.inf, np.eye(6), np.zeros(6)
+    off, jacobian = linear[0], linear[1].reshape(-1, 6)
+    square = (off**2).sum(axis=1)
+    weighted = (jacobian * np.repeat(1 / (1 + square), 2)[:, None]).T
+    return float(np.log1p(square).sum()), weighted @ jacobian, -weighted @ off.ravel()
+
+
+def _covariance(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> Floats:
+    linear = _linearised(pose, points_m, rays, near)
+    if linear is None:
+        return np.full((6, 6), np.inf)
+    off, jacobian, _ = linear
+    weight = 1 / (1 + (off**2).sum(axis=1))
+    gradient = (jacobian * off[..., None]).sum(axis=1) * weight[:, None]
+    flat = jacobian.reshape(-1, 6)
+    hessian = (flat * np.repeat(weight, 2)[:, None]).T @ flat - 2 * gradient.T @ gradient
+    inverse = np.linalg.pinv(hessian, hermitian=True)
+    freedom = 2 * len(off) / max(2 * len(off) - 6, 1)
+    return np.asarray(freedom * inverse @ (gradient.T @ gradient) @ inverse)
 
 
 _CROSS = -np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)

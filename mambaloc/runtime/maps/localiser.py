@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb
-from mambaloc.runtime.maps.absolute_pose import CameraPose, ransac_pose, refine_pose
+from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, ransac_pose, refine_pose
+from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, Evidence, is_another_focal_length, occupied_cells
 from mambaloc.runtime.maps.drift import Drift
 from mambaloc.runtime.maps.features import (
     Features,
@@ -24,7 +26,7 @@ from mambaloc.runtime.maps.features import (
 )
 from mambaloc.runtime.maps.sparse_map import SparseMap
 from mambaloc.runtime.maps.viewpoints import spread_m, viewpoints
-from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
+from mambaloc.runtime.rotations import quaternion_from_matrix
 
 Floats = NDArray[np.floating[Any]]
 
@@ -36,9 +38,6 @@ _NEAREST = 8  # key frames whose points are searched again
 _WINDOWS = (6.0, 2.0)  # radii of the guided rounds, in times of what is near
 _PRIOR_WINDOW = 12.0  # likewise, around a prior: 54 px at a width of 160
 _LEAST_SHARE = 0.1
-_MOST_DEVIATION = 0.04  # of the key frames' spread; wrong poses rest on few matches, or on matches in one corner
-_CONFIRMED_INLIERS, _CONFIRMED_DEVIATION = 8, 0.06
-_CONFIRMED_MOVE, _CONFIRMED_TURN_DEG = 0.5, 15.0  # of the key frames' spread: a wrong pose is rarely that near a prior
 
 
 @dataclass(frozen=True)
@@ -53,13 +52,14 @@ class MapLocalisation:
         position_m: in the map's frame.
         quaternion: likewise.
         inliers: matches that agree with the pose.
-        is_accepted: whether to believe it: there are enough, and they fix the position to 4 % of the spread of the
-            map's key frames, one standard deviation in the worst direction.
+        is_accepted: whether to believe it: it is as probable as
+            :data:`~mambaloc.runtime.maps.acceptance.LEAST_PROBABILITY`, and has as many inliers as the map asks for.
         covariance: of the position in metres, then of the rotation in radians about the fixed axes of the world: the
             order and frame of ROS's PoseWithCovariance. It says how well the matches fix the pose; errors that the
             map's own poses share are not in it.
-        is_confirmed: whether a prior is near a pose that is not accepted: within half of the key frames' spread and 15
-            degrees of one that 8 matches or more fix to 6 % of the spread.
+        probability: that it is right; 0 where matches ask for another focal length.
+        focal_scale: how many times the given focal length matches ask for; None where they do not contradict it.
+        evidence: what the probability rests on otherwise; None where no pose was found.
     """
 
     position_m: Floats
@@ -67,7 +67,17 @@ class MapLocalisation:
     inliers: int
     is_accepted: bool
     covariance: Floats
-    is_confirmed: bool = False
+    probability: float = 0.0
+    focal_scale: float | None = None
+    evidence: Evidence | None = None
+
+
+class _Matches(NamedTuple):
+    """Rows of keypoints and of points, and which matches are distinctive: the most similar of all points in view."""
+
+    keypoints: NDArray[np.int64]
+    points: NDArray[np.int64]
+    is_distinctive: NDArray[np.bool_]
 
 
 class MapLocaliser:
@@ -128,19 +138,10 @@ class MapLocaliser:
         found = self._settled(features, start)
         if prior is None or found.is_accepted:
             return found
-        keypoints, points = self._search(features, self.drift.to_adjusted(prior), _PRIOR_WINDOW * self._near)
-        start = ransac_pose(self._points_m[points], features.rays[keypoints], self._near, rng)
-        both = [self._confirmed(each, prior) for each in (found, self._settled(features, start))]
-        return max(both, key=lambda each: (each.is_accepted, each.is_confirmed, each.inliers))
-
-    def _confirmed(self, found: MapLocalisation, prior: CameraPose) -> MapLocalisation:
-        move = np.linalg.norm(found.position_m - prior.position_m) / self._unit_m
-        turn_deg = rotation_error_deg(found.quaternion, quaternion_from_matrix(prior.rotation))
-        is_near = move <= _CONFIRMED_MOVE and turn_deg <= _CONFIRMED_TURN_DEG
-        is_fixed = found.inliers >= _CONFIRMED_INLIERS and _deviation_m(found.covariance) <= (
-            _CONFIRMED_DEVIATION * self._unit_m
-        )
-        return replace(found, is_confirmed=bool(is_near and is_fixed))
+        around = self._search(features, self.drift.to_adjusted(prior), _PRIOR_WINDOW * self._near)
+        start = ransac_pose(self._points_m[around.points], features.rays[around.keypoints], self._near, rng)
+        both = (found, self._settled(features, start))
+        return max(both, key=lambda each: (each.is_accepted, each.probability, each.inliers))
 
     def _settled(self, features: Features, start: CameraPose | None) -> MapLocalisation:
         """Search around a pose and refine it, twice."""
@@ -149,42 +150,58 @@ class MapLocaliser:
         near = self._near
         pose, scale = start, near / 2  # of the refinement; finer where the matches are
         for window in _WINDOWS:
-            keypoints, points = self._search(features, pose, window * near)
-            if len(points) < 4:
+            matches, finest = self._search(features, pose, window * near), scale
+            if len(matches.points) < 4:
                 return _nowhere()
-            seen_m, rays = self._points_m[points], features.rays[keypoints]
-            pose, covariance = refine_pose(pose, seen_m, rays, scale)
+            seen_m, rays = self._points_m[matches.points], features.rays[matches.keypoints]
+            pose, covariance = refine_pose(pose, seen_m, rays, finest)
             off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
             scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
-        inliers = int((off <= near).sum())
-        is_fixed = _deviation_m(covariance) <= _MOST_DEVIATION * self._unit_m
-        is_accepted = inliers >= self.map.least_inliers and is_fixed
-        pose, unsure = self.drift.to_given(pose)
-        covariance = covariance + unsure
-        return MapLocalisation(pose.position_m, quaternion_from_matrix(pose.rotation), inliers, is_accepted, covariance)
+        is_inlier = off <= near
+        is_distinctive = matches.is_distinctive
+        pixels = features.pixels[matches.keypoints[is_distinctive & is_inlier]]
+        deviation = np.inf
+        if is_distinctive.sum() >= 4:
+            _, of_distinctive = refine_pose(pose, seen_m[is_distinctive], rays[is_distinctive], finest)
+            deviation = _deviation_m(of_distinctive) / self._unit_m
+        turn_deg = np.degrees(np.linalg.norm(cv2.Rodrigues(start.rotation.T @ pose.rotation)[0]))
+        evidence = Evidence(occupied_cells(pixels, features.size), deviation, float(turn_deg))
+        focal = focal_scale(pose, seen_m, rays, finest)
+        focal_off = focal[0] if is_another_focal_length(*focal) else None
+        probability = evidence.probability if focal_off is None else 0.0
+        given, unsure = self.drift.to_given(pose)
+        return MapLocalisation(
+            given.position_m,
+            quaternion_from_matrix(given.rotation),
+            int(is_inlier.sum()),
+            bool(probability >= LEAST_PROBABILITY and is_inlier.sum() >= self.map.least_inliers),
+            covariance + unsure,
+            probability,
+            focal_off,
+            evidence,
+        )
 
     def matches(self, features: Features, pose: CameraPose) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Points that a picture shows where its pose projects them: rows of keypoints and of points."""
-        return self._search(features, pose, self._near)
+        found = self._search(features, pose, self._near)
+        return found.keypoints, found.points
 
-    def _search(
-        self, features: Features, pose: CameraPose, radius: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Match again what a pose projects near a keypoint: rows of keypoints and of points."""
+    def _search(self, features: Features, pose: CameraPose, radius: float) -> _Matches:
+        """Match again what a pose projects near a keypoint."""
         projected, _ = pose.project(self._points_m)
         corners = features.corner_rays
         with np.errstate(invalid="ignore"):
             inside = ((projected >= corners[0]) & (projected <= corners[1])).all(axis=1)
         visible = np.flatnonzero(inside & self._seen_around(pose))
+        similarity = features.descriptors @ self._descriptors[visible].T
         x, y = (features.rays.T[..., None] - projected[visible].T[:, None]).astype(np.float32)
-        nearby = np.where(
-            x * x + y * y <= radius**2, features.descriptors @ self._descriptors[visible].T, np.float32(-1)
-        )
+        nearby = np.where(x * x + y * y <= radius**2, similarity, np.float32(-1))
         best, is_clear = unambiguous(nearby, _GUIDED_RATIO)
         keep = is_clear & mutual(nearby, best)
         rows = np.flatnonzero(keep)
         rows = rows[distance(nearby[rows, best[rows]]) < _GUIDED_FARTHEST]
-        return rows, visible[best[rows]]
+        is_distinctive = nearby[rows, best[rows]] >= similarity[rows].max(axis=1, initial=-1)
+        return _Matches(rows, visible[best[rows]], is_distinctive)
 
     def _seen_around(self, pose: CameraPose) -> NDArray[np.bool_]:
         """Which points one of the nearest key frames sees, (P,): what is hidden from there is not searched.

@@ -16,6 +16,7 @@ from safetensors.numpy import load, save
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
 from mambaloc.images import LARGEST_SIDE_PX
+from mambaloc.runtime.maps.acceptance import RULE
 from mambaloc.runtime.maps.features import check_intrinsics
 from mambaloc.runtime.maps.lens import Lens
 
@@ -78,8 +79,9 @@ class SparseMap:
     def save(self, path: Path) -> None:
         """Write it to a safetensors file, whole or not at all.
 
-        The header's metadata hold one entry, ``about``: JSON with the format's version, the scene, the rule of
-        acceptance, digests, and a CRC-32 of the arrays in the order of their names.
+        The header's metadata hold one entry, ``about``: JSON with the format's version, the scene, the version of the
+        rule of acceptance and the inliers that this map asks for besides, digests, and a CRC-32 of the arrays in the
+        order of their names.
 
         Raises:
             InputError: where it cannot be written.
@@ -98,6 +100,7 @@ class SparseMap:
             "version": VERSION,
             "scene": self.scene,
             "least_inliers": self.least_inliers,
+            "rule": RULE,
             "digests": self.digests,
             "sessions": self.sessions,
             "crc32": _crc32(arrays),
