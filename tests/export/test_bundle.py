@@ -216,6 +216,7 @@ def test_native_apps_decide_as_python_does():
             *maps_localiser._WINDOWS,
             maps_localiser._LEAST_SHARE,
             maps_localiser._PRIOR_WINDOW,
+            maps_localiser._SHARED,
         ),
         *(acceptance._CELLS, acceptance.LEAST_PROBABILITY, localisation._UNSTATED),
         *map(abs, (acceptance._CONSTANT, acceptance._PER_CELLS, acceptance._PER_DEVIATION, acceptance._PER_TURN)),

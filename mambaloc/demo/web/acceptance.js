@@ -1,6 +1,6 @@
 /** How probable it is that a pose found in a map is right, as `mambaloc/runtime/maps/acceptance.py` says it. No DOM. */
 
-export const LEAST_PROBABILITY = 0.92;
+export const LEAST_PROBABILITY = 0.95;
 const CELLS = 4; // a side of the grid
 const [CONSTANT, PER_CELLS, PER_DEVIATION, PER_TURN] = [-5, 3.29, -0.45, -0.91];
 const [LEAST_DEVIATION, LEAST_TURN_DEG] = [1e-3, 0.1];

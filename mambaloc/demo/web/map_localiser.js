@@ -19,6 +19,7 @@ const NEAREST = 8; // key frames whose points are searched again
 const WINDOWS = [6, 2]; // radii of the guided rounds, in times of what is near
 const PRIOR_WINDOW = 12; // likewise, around a prior
 const LEAST_SHARE = 0.1;
+const SHARED = 1.25; // of variances: neighbouring matches share errors
 const LENS_STEPS = 10;
 const SAME = 0.01; // of the width, by which a camera may differ from the map's and still be its own
 
@@ -104,7 +105,7 @@ export class MapLocaliser {
       quaternion_wxyz: quaternionOf(rotation),
       inliers,
       isAccepted: probability >= LEAST_PROBABILITY && inliers >= this.#map.about.least_inliers,
-      covariance: covariance?.map((row, i) => row.map((value, j) => value + (carried?.unsure[i][j] ?? 0))),
+      covariance: covariance?.map((row, i) => row.map((value, j) => SHARED * value + (carried?.unsure[i][j] ?? 0))),
       probability,
       focalScale: focalOff,
       matches: shown,

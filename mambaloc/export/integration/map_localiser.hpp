@@ -42,7 +42,7 @@ struct MapLocalisation {
   CameraPose pose;
   int inliers = 0;
   bool accepted = false;
-  double probability = 0;  // that it is within 0.2 m and 5 degrees; it is accepted from 0.92 on
+  double probability = 0;  // that it is within 0.2 m and 5 degrees; it is accepted from 0.95 on
   double focal_scale = 1;  // times the given focal length, where matches contradict that; the probability is 0 then
   // Position in metres, then rotation in radians about the world's axes: the order and frame of ROS.
   cv::Matx66d covariance;
@@ -245,10 +245,10 @@ class MapLocaliser {
         answer.probability = std::isfinite(share) ? 1 / (1 + std::exp(-evidence)) : 0;
       }
     }
-    answer.accepted = answer.probability >= 0.92 && answer.inliers >= least_inliers_;
+    answer.accepted = answer.probability >= 0.95 && answer.inliers >= least_inliers_;
     const auto [given, unsure] = carried(pose, 1);
     answer.pose = given;
-    answer.covariance += unsure;
+    answer.covariance = 1.25 * answer.covariance + unsure;  // neighbouring matches share errors
     return answer;
   }
 

@@ -121,7 +121,8 @@ def focal_scale(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -
     weighted = (jacobian * np.repeat(weight, 2)[:, None]).T
     inverse = np.linalg.pinv(weighted @ jacobian, hermitian=True)
     variance = inverse[6, 6] * float(weight @ square) / max(2 * len(off) - 7, 1)
-    return float(np.exp(-inverse[6] @ weighted @ off.ravel())), float(np.sqrt(variance)) if variance > 0 else np.inf
+    step = float(np.clip(-inverse[6] @ weighted @ off.ravel(), -1, 1))
+    return float(np.exp(step)), float(np.sqrt(variance)) if variance > 0 else np.inf
 
 
 def _moved(pose: CameraPose, step: Floats) -> CameraPose:

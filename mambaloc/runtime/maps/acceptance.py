@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 RULE = 1
 """Version of what follows."""
-LEAST_PROBABILITY = 0.92
+LEAST_PROBABILITY = 0.95
 """A pose that is as probable is accepted: of such poses of frames held out of training, at most 0.5 % were wrong."""
-CALIBRATION = {"frames": 0, "answers": 0, "accepted": 0.0, "accepted_and_wrong": 0.0}
-"""What it was calibrated on: frames held out of training, answers to disturbed pictures of them, and their shares."""
+CALIBRATION = {"frames": 272, "pictures": 3941, "accepted": 0.652, "accepted_and_wrong": 0.0027}
+"""What that rests on: frames held out of training, of two rooms and a rendered third; pictures of them, disturbed, that
+gave a pose; the share that is accepted, with 20 inliers; and of these the wrong ones' (95 %: 0.13 to 0.56 %)."""
 
 _CELLS = 4  # a side of the grid
 _CONSTANT, _PER_CELLS, _PER_DEVIATION, _PER_TURN = -5.0, 3.29, -0.45, -0.91

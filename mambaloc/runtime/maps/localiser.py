@@ -38,6 +38,7 @@ _NEAREST = 8  # key frames whose points are searched again
 _WINDOWS = (6.0, 2.0)  # radii of the guided rounds, in times of what is near
 _PRIOR_WINDOW = 12.0  # likewise, around a prior: 54 px at a width of 160
 _LEAST_SHARE = 0.1
+_SHARED = 1.25  # of variances: neighbouring matches share errors; chosen on frames held out of rendered rooms
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ class MapLocaliser:
             quaternion_from_matrix(given.rotation),
             int(is_inlier.sum()),
             bool(probability >= LEAST_PROBABILITY and is_inlier.sum() >= self.map.least_inliers),
-            covariance + unsure,
+            _SHARED * covariance + unsure,
             probability,
             focal_off,
             evidence,
