@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.images import read_image
 from mambaloc.runtime.maps import MapLocaliser, SparseMap
-from mambaloc.runtime.maps.absolute_pose import CameraPose, refine_pose
+from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, refine_pose
+from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, Evidence, is_another_focal_length
 from mambaloc.runtime.maps.drift import Drift, fit_drift
 from mambaloc.runtime.maps.lens import Lens
 from mambaloc.runtime.rotations import rotation_error_deg
@@ -85,6 +86,10 @@ def test_keypoints_are_opencvs(found):
     assert counts[-1] == 0
 
 
+EVIDENCE = [(0, 0.5, 3.0), (7, 0.03, 1.2), (16, 0.0004, 0.05), (12, 0.011, 0.4)]
+"""Cells, deviations and turns."""
+
+
 def random_problem(rng, count):
     """Points before a camera, and where it sees them in the plane at depth 1."""
     rotation = Rotation.random(random_state=rng).as_matrix()
@@ -123,6 +128,7 @@ def solved(node):
              "start": {"rotation": s[0].ravel().tolist(), "position_m": s[1].tolist()}}
             for _, _, p, r, s in manies
         ] + [{"points": p[:3].tolist(), "rays": r[:3].tolist(), "near": 0.02} for _, _, p, r, _ in manies[:1]],
+        "evidence": EVIDENCE,
     }  # fmt: skip
     return threes, manies, json.loads(node(HERE / "poses.mjs", WEB, input=json.dumps(asked)))
 
@@ -162,6 +168,20 @@ def test_refinement_is_pythons(solved):
         np.testing.assert_allclose(found["refined"]["pose"]["position_m"], pose.position_m, atol=1e-6)
         np.testing.assert_allclose(np.reshape(found["refined"]["pose"]["rotation"], (3, 3)), pose.rotation, atol=1e-6)
         np.testing.assert_allclose(found["refined"]["covariance"], covariance, rtol=1e-3, atol=1e-9)
+
+
+def test_focal_lengths_and_probabilities_are_pythons(solved):
+    _, manies, answer = solved
+    for (_, _, points, rays, _), found in zip(manies, answer["many"], strict=False):
+        refined = found["refined"]["pose"]
+        pose = CameraPose(np.reshape(refined["rotation"], (3, 3)), np.array(refined["position_m"]))
+        scale, deviation = focal_scale(pose, points, rays, 0.02)
+        assert found["focal"]["scale"] == pytest.approx(scale, abs=1e-6)
+        assert found["focal"]["deviation"] == pytest.approx(deviation, rel=1e-3)
+        assert found["isAnother"] is is_another_focal_length(scale, deviation)
+    for said, values in zip(answer["probabilities"], EVIDENCE, strict=True):
+        assert said == pytest.approx(Evidence(*values).probability, abs=1e-12)
+    assert answer["least"] == LEAST_PROBABILITY
 
 
 def adjusted(path, folder):
@@ -210,6 +230,8 @@ def test_poses_in_a_map_are_pythons(den, map_of_den, is_adjusted, modules, tmp_p
         assert 1000 * np.linalg.norm(np.array(found["position_m"]) - expected.position_m) < 10
         assert rotation_error_deg(np.array(found["quaternion_wxyz"]), expected.quaternion) < 0.3
         assert abs(found["inliers"] - expected.inliers) <= 3
+        assert found["probability"] == pytest.approx(expected.probability, abs=0.02)
+        assert found["focalScale"] is expected.focal_scale is None
         deviation = [np.sqrt(np.trace(np.array(each)[:3, :3])) for each in (found["covariance"], expected.covariance)]
         assert deviation[0] == pytest.approx(deviation[1], rel=0.2)
         offs = np.array([match["off"] for match in found["matches"]])
