@@ -195,7 +195,8 @@ class MapLocaliser:
             inside = ((projected >= corners[0]) & (projected <= corners[1])).all(axis=1)
         visible = np.flatnonzero(inside & self._seen_around(pose))
         similarity = features.descriptors @ self._descriptors[visible].T
-        x, y = (features.rays.T[..., None] - projected[visible].T[:, None]).astype(np.float32)
+        seen, at = (each.T.astype(np.float32) for each in (features.rays, projected[visible]))
+        x, y = (ours[:, None] - theirs for ours, theirs in zip(seen, at, strict=True))
         nearby = np.where(x * x + y * y <= radius**2, similarity, np.float32(-1))
         best, is_clear = unambiguous(nearby, _GUIDED_RATIO)
         keep = is_clear & mutual(nearby, best)
