@@ -19,6 +19,7 @@ from mambaloc.console import progress
 from mambaloc.errors import InputError
 from mambaloc.files import writing
 from mambaloc.images import Image, read_image
+from mambaloc.mapping.building import MapSettings
 from mambaloc.mapping.evaluating import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.maps import CameraPose, MapLocalisation, MapLocaliser
@@ -121,7 +122,9 @@ def _scores(answer: MapLocalisation, evidence: Evidence, truth: Floats) -> tuple
 
 
 def calibrate(folders: Sequence[Path]) -> str:
-    """Fit the regression to what :func:`collect_evidence` wrote, leaving out a sequence in turn for the shares.
+    """Fit the regression to what :func:`collect_evidence` wrote, and say what the fit and the rule as it is accept.
+
+    The fit is of all sequences but one for the answers to that one.
 
     Raises:
         InputError: for a folder without evidence.
@@ -130,30 +133,46 @@ def calibrate(folders: Sequence[Path]) -> str:
     is_wrong = (of["off_m"] > FAR_M) | (of["off_deg"] > FAR_DEG)
     says = np.isfinite(of["deviation"])
     columns = zip(of["cells"], of["deviation"], of["turn_deg"], strict=True)
-    known = np.array([Evidence(int(cells), *others).logarithms() for cells, *others in columns])
+    evidence = [Evidence(int(cells), *others) for cells, *others in columns]
+    known = np.array([each.logarithms() for each in evidence])
     is_asked = of["disturbance"] <= _NAMES.index(_RANDOM)
-    whole = _fit(known[says & is_asked], is_wrong[says & is_asked])
     group = 100 * scene + of["fold"]
+    pictures = np.column_stack((group, of["frame"], of["picture"]))
+    fit = _fit(known[says & is_asked], is_wrong[says & is_asked])
+    lines = [
+        "constant, log(cells + 0.5), log(deviation), log(turn + 0.1): " + " ".join(f"{each:.2f}" for each in fit),
+        f"{len(np.unique(pictures[:, :2], axis=0))} frames, {len(np.unique(pictures[is_asked], axis=0))} pictures with "
+        f"a pose, {int(is_asked.sum())} poses",
+    ]
+    can = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
+    probability = _left_out(known, is_wrong, says, is_asked, group)
+    chosen = is_asked & _likeliest(pictures, probability)
+    lines.append(_shares("fitted to the others", chosen, can & (probability >= LEAST_PROBABILITY), is_wrong))
+    probability = np.array([each.probability for each in evidence])
+    is_final, accepted = _likeliest(pictures, probability), can & (probability >= LEAST_PROBABILITY)
+    rows = {"the rule as it is": is_asked}
+    rows |= {folder.name: is_asked & (scene == number) for number, folder in enumerate(folders)}
+    rows |= {name: of["disturbance"] == number for number, name in enumerate(_NAMES)}
+    lines += [_shares(name, each & is_final, accepted, is_wrong) for name, each in rows.items() if each.any()]
+    lines += _bins(probability[is_asked & is_final], of["off_m"][is_asked & is_final], is_wrong[is_asked & is_final])
+    sure = (of["disturbance"] == 0) & accepted & is_final & ~is_wrong
+    return "\n".join(lines + [_covered(folder.name, of, sure & (scene == n)) for n, folder in enumerate(folders)])
+
+
+def _left_out(
+    known: Floats, is_wrong: NDArray[np.bool_], says: NDArray[np.bool_], is_asked: NDArray[np.bool_], group: Floats
+) -> Floats:
+    """Probabilities by regressions on the other groups; 0 for answers without evidence."""
     probability = np.zeros(len(says))
     for each in np.unique(group):
         rest, left_out = says & is_asked & (group != each), says & (group == each)
         probability[left_out] = _probability(_fit(known[rest], is_wrong[rest]), known[left_out])
-    is_final = _likeliest(np.column_stack((group, of["frame"], of["picture"])), probability)
-    accepted = (probability >= LEAST_PROBABILITY) & (of["focal"] == 0)
-    frames = len(np.unique(np.column_stack((group, of["frame"])), axis=0))
-    lines = [
-        "constant, log(cells + 0.5), log(deviation), log(turn + 0.1): " + " ".join(f"{each:.2f}" for each in whole),
-        f"{frames} frames, {int((is_asked & is_final).sum())} pictures with a pose, {int(is_asked.sum())} poses",
-    ]
-    rows = {"all": is_asked, **{folder.name: is_asked & (scene == n) for n, folder in enumerate(folders)}}
-    rows |= {name: of["disturbance"] == number for number, name in enumerate(_NAMES)}
-    lines += [_shares(name, each & is_final, accepted, is_wrong) for name, each in rows.items() if each.any()]
-    lines += _bins(probability[is_asked & is_final], of["off_m"][is_asked & is_final], is_wrong[is_asked & is_final])
-    for number, folder in enumerate(folders):
-        sure = (scene == number) & (of["disturbance"] == 0) & accepted & is_final & ~is_wrong
-        inside = [(of[key][sure] <= chi2.ppf(0.9, n)).mean() for key, n in (("pose_chi2", 6), ("position_chi2", 3))]
-        lines.append(f"{folder.name}: {inside[0]:.1%} of poses, {inside[1]:.1%} of positions in the 90 % ellipsoid")
-    return "\n".join(lines)
+    return probability
+
+
+def _covered(name: str, of: dict[str, Floats], rows: NDArray[np.bool_]) -> str:
+    inside = [(of[key][rows] <= chi2.ppf(0.9, n)).mean() for key, n in (("pose_chi2", 6), ("position_chi2", 3))]
+    return f"{name}: {inside[0]:.1%} of poses, {inside[1]:.1%} of positions in the 90 % ellipsoid"
 
 
 def _read(folders: Sequence[Path]) -> tuple[dict[str, Floats], NDArray[np.int64]]:
