@@ -7,7 +7,7 @@
  */
 
 import { posesOfThree } from "./three_points.js";
-import { cross, dot, inverse, product, solved, unit } from "./vectors.js";
+import { cross, inverse, product, solved, unit } from "./vectors.js";
 
 const TRIALS = 1000;
 const CONFIDENCE = 0.9999;
@@ -126,23 +126,20 @@ export function refinePose(start, points, rays, near) {
 export function focalScale(pose, points, rays, near) {
   const linear = linearised(pose, points, rays, near);
   if (!linear) return { scale: 1, deviation: Infinity };
-  const normal = Array.from({ length: 7 }, () => new Array(7).fill(0));
-  const right = new Array(7).fill(0);
+  const { off, jacobian, seen, weights } = linear;
+  const [normal, right] = [zeros(7, 7), new Float64Array(7)];
   let squares = 0;
-  for (const { off, jacobian, seen } of linear) {
-    const square = off[0] ** 2 + off[1] ** 2;
-    const weight = 1 / (1 + square);
-    squares += weight * square;
-    for (let axis = 0; axis < 2; axis++) {
-      const row = [...jacobian[axis], (seen[axis] * 2) / near];
-      addOuter(normal, row, weight);
-      row.forEach((value, i) => (right[i] -= weight * value * off[axis]));
-    }
+  for (let i = 0; i < off.length; i++) {
+    const row = [...jacobian.subarray(6 * i, 6 * i + 6), (seen[i] * 2) / near];
+    addOuter(normal, row, weights[i >> 1]);
+    row.forEach((value, j) => (right[j] -= weights[i >> 1] * value * off[i]));
+    squares += weights[i >> 1] * off[i] ** 2;
   }
   const found = inverse(normal);
-  const variance = found ? (found[6][6] * squares) / Math.max(2 * linear.length - 7, 1) : 0;
+  const variance = found ? (found[6][6] * squares) / Math.max(off.length - 7, 1) : 0;
   if (!(variance > 0)) return { scale: 1, deviation: Infinity };
-  return { scale: Math.exp(found[6].reduce((sum, value, i) => sum + value * right[i], 0)), deviation: Math.sqrt(variance) };
+  const step = found[6].reduce((sum, value, i) => sum + value * right[i], 0);
+  return { scale: Math.exp(step), deviation: Math.sqrt(variance) };
 }
 
 /** Move a pose by metres, and turn it by radians about the world's axes. */
@@ -161,58 +158,67 @@ export function moved({ rotation, position_m }, [dx, dy, dz, ...turn]) {
   };
 }
 
-/** Each match's residual in halves of `near`, its slopes, and where its point is seen; null where one is not in front. */
+/**
+ * Residuals in halves of `near`, two a match; their slopes, six of each; where points are seen; and Cauchy's weights of
+ * matches. Null where a point is not in front.
+ */
 function linearised({ rotation: r, position_m: [px, py, pz] }, points, rays, near) {
-  const linear = [];
-  for (let i = 0, j = 0; i < rays.length; i += 2, j += 3) {
-    const towards = [points[j] - px, points[j + 1] - py, points[j + 2] - pz];
-    const [x, y, depth] = [0, 1, 2].map((axis) => dot([r[axis], r[3 + axis], r[6 + axis]], towards));
+  const count = rays.length / 2;
+  const [off, seen, jacobian, weights] = [2, 2, 12, 1].map((each) => new Float64Array(each * count));
+  for (let i = 0; i < count; i++) {
+    const [x, y, z] = [points[3 * i] - px, points[3 * i + 1] - py, points[3 * i + 2] - pz];
+    const depth = r[2] * x + r[5] * y + r[8] * z;
     if (depth <= LEAST_DEPTH) return null;
-    const seen = [x / depth, y / depth];
-    const off = seen.map((value, axis) => ((value - rays[i + axis]) * 2) / near);
-    const jacobian = [0, 1].map((axis) => {
+    for (let axis = 0; axis < 2; axis++) {
+      const at = 2 * i + axis;
+      seen[at] = (r[axis] * x + r[3 + axis] * y + r[6 + axis] * z) / depth;
+      off[at] = ((seen[at] - rays[at]) * 2) / near;
       // d off / d point; a turn about the world's axes moves a point by towards x turn.
-      const slope = [0, 3, 6].map((row) => ((r[row + axis] - seen[axis] * r[row + 2]) * 2) / near / depth);
-      return [-slope[0], -slope[1], -slope[2], ...cross(slope, towards)];
-    });
-    linear.push({ off, jacobian, seen });
+      const factor = 2 / near / depth;
+      const a = (r[axis] - seen[at] * r[2]) * factor;
+      const b = (r[3 + axis] - seen[at] * r[5]) * factor;
+      const c = (r[6 + axis] - seen[at] * r[8]) * factor;
+      jacobian.set([-a, -b, -c, b * z - c * y, c * x - a * z, a * y - b * x], 6 * at);
+    }
+    weights[i] = 1 / (1 + off[2 * i] ** 2 + off[2 * i + 1] ** 2);
   }
-  return linear;
+  return { off, jacobian, seen, weights };
 }
 
 /** Cost, `J^T W J` and `-J^T W r` of residuals `r`. */
 function normalEquations(pose, points, rays, near) {
-  const normal = Array.from({ length: 6 }, () => new Array(6).fill(0));
-  const right = new Array(6).fill(0);
+  const [normal, right] = [zeros(6, 6), new Array(6).fill(0)];
   const linear = linearised(pose, points, rays, near);
   if (!linear) return { cost: Infinity, normal, right };
-  let cost = 0;
-  for (const { off, jacobian } of linear) {
-    const square = off[0] ** 2 + off[1] ** 2;
-    cost += Math.log1p(square);
-    for (let axis = 0; axis < 2; axis++) {
-      addOuter(normal, jacobian[axis], 1 / (1 + square));
-      jacobian[axis].forEach((value, i) => (right[i] -= (value * off[axis]) / (1 + square)));
-    }
+  const { off, jacobian, weights } = linear;
+  for (let i = 0; i < off.length; i++) {
+    const [row, weight] = [jacobian.subarray(6 * i, 6 * i + 6), weights[i >> 1]];
+    addOuter(normal, row, weight);
+    for (let j = 0; j < 6; j++) right[j] -= weight * row[j] * off[i];
   }
-  return { cost, normal, right };
+  return { cost: weights.reduce((sum, weight) => sum - Math.log(weight), 0), normal, right };
 }
 
 /** `H^-1 (sum of g g^T) H^-1` of the cost's Hessian and each match's gradient; null where `H` is singular. */
 function covarianceOf(pose, points, rays, near) {
   const linear = linearised(pose, points, rays, near);
   if (!linear) return null;
-  const [hessian, squares] = [0, 1].map(() => Array.from({ length: 6 }, () => new Array(6).fill(0)));
-  for (const { off, jacobian } of linear) {
-    const weight = 1 / (1 + off[0] ** 2 + off[1] ** 2);
-    const gradient = jacobian[0].map((value, i) => weight * (value * off[0] + jacobian[1][i] * off[1]));
-    for (const row of jacobian) addOuter(hessian, row, weight);
+  const { off, jacobian, weights } = linear;
+  const [hessian, squares, gradient] = [zeros(6, 6), zeros(6, 6), new Float64Array(6)];
+  for (let i = 0; i < off.length; i += 2) {
+    const weight = weights[i / 2];
+    const [one, other] = [0, 6].map((from) => jacobian.subarray(6 * i + from, 6 * i + from + 6));
+    for (let j = 0; j < 6; j++) gradient[j] = weight * (one[j] * off[i] + other[j] * off[i + 1]);
+    addOuter(hessian, one, weight);
+    addOuter(hessian, other, weight);
     addOuter(hessian, gradient, -2);
-    addOuter(squares, gradient, (2 * linear.length) / Math.max(2 * linear.length - 6, 1));
+    addOuter(squares, gradient, off.length / Math.max(off.length - 6, 1));
   }
   const found = inverse(hessian);
   return found && product(product(found, squares), found);
 }
+
+const zeros = (rows, columns) => Array.from({ length: rows }, () => new Array(columns).fill(0));
 
 /** Add the outer product of a row with itself, times a weight. */
 function addOuter(matrix, row, weight) {

@@ -36,8 +36,8 @@ export class Localiser {
   }
 
   /**
-   * Localise one picture: the map's pose where it is accepted or likelier to be right than the network's, which is
-   * the answer otherwise.
+   * Localise one picture: the map's pose where it is accepted or likelier to be right than the network's, which is the
+   * answer otherwise.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels, for the map; the map's camera unless given.
    * @returns as {@link Network#localise}; and `source`, "map" or "network"; `network`, its own answer; where there is a

@@ -2,10 +2,9 @@
 
 import { focalScale, project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
 import { LEAST_PROBABILITY, isAnotherFocalLength, occupiedCells, probabilityOf } from "./acceptance.js";
-import { LENGTH } from "./descriptors.js";
 import { Drift } from "./drift.js";
 import { matrixOf, median, quaternionOf } from "./geometry.js";
-import { Matcher, distinctiveOf, matchNearby } from "./matching.js";
+import { Matcher, matchNearby } from "./matching.js";
 import { greyPicture } from "./pictures.js";
 import { detectFeatures } from "./sift.js";
 import { cameraOf } from "./sparse_map.js";
@@ -43,7 +42,7 @@ export class MapLocaliser {
     this.#near = (4.5 * map.width) / 160 / map.intrinsics.fx;
     this.#unit_m = spreadOf(map.keyPoses);
     this.#viewpoints = map.keyPoses.map((pose) => viewpoint(pose, this.#unit_m));
-    this.#matcher = new Matcher(map.descriptors.subarray(0, AT_ONCE * LENGTH));
+    this.#matcher = new Matcher(map.descriptors, AT_ONCE);
     this.#drift = map.drift.length ? new Drift(map.keyPoses, map.drift) : null;
   }
 
@@ -114,7 +113,7 @@ export class MapLocaliser {
 
   /** That a pose is right, by its distinctive matches. */
   #probability(features, start, pose, matches, shown, scale) {
-    const rows = distinctiveOf(features, matches, this.#map.descriptors);
+    const rows = this.#matcher.distinctive(features, matches);
     let deviation = Infinity;
     if (rows.length >= 4) {
       const [keypoints, points] = [matches.keypoints, matches.points].map((all) => rows.map((i) => all[i]));
@@ -163,7 +162,7 @@ export class MapLocaliser {
     if (isOwn && isSame((grey.height * width) / grey.width, height)) straighten(rays, lens);
     const end = { x: grey.width - 0.5, y: grey.height - 0.5 };
     const corners = [(-0.5 - cx) / fx, (-0.5 - cy) / fy, (end.x - cx) / fx, (end.y - cy) / fy];
-    return { ...features, rays, corners };
+    return this.#matcher.turned({ ...features, rays, corners });
   }
 
   /** The map's camera for a picture of its shape; null for another. */

@@ -8,16 +8,43 @@ const HEAD = 24; // numbers of a turned descriptor that most decisions need
 export class Matcher {
   #order;
   #points;
+  #atOnce;
 
   /**
    * @param {Float32Array} descriptors of the points.
+   * @param {number} atOnce so many of the first are matched at once.
    */
-  constructor(descriptors) {
+  constructor(descriptors, atOnce) {
     const spectra = spectraOf(descriptors);
     const energy = new Float64Array(LENGTH);
     spectra.forEach((value, i) => (energy[i % LENGTH] += value * value));
     this.#order = [...energy.keys()].sort((a, b) => energy[b] - energy[a]);
     this.#points = split(spectra, this.#order);
+    this.#atOnce = Math.min(atOnce, this.#points.rests.length);
+  }
+
+  /** Add the turned descriptors to a picture's features, for the methods below. */
+  turned(features) {
+    return { ...features, turned: split(spectraOf(features.descriptors), this.#order) };
+  }
+
+  /**
+   * Rows of matches that are distinctive: no point in view is more similar to the keypoint than its own.
+   * @param features of `turned`.
+   * @param {{keypoints: number[], points: number[], visible: number[]}} matches of {@link matchNearby}.
+   */
+  distinctive({ turned: { heads, tails, rests } }, { keypoints, points, visible }) {
+    const theirs = this.#points;
+    const head = (keypoint, point) => product(heads, keypoint, theirs.heads, point, HEAD);
+    const tail = (keypoint, point) => product(tails, keypoint, theirs.tails, point, LENGTH - HEAD);
+    return [...keypoints.keys()].filter((row) => {
+      const keypoint = keypoints[row];
+      const own = head(keypoint, points[row]) + tail(keypoint, points[row]);
+      return visible.every((point) => {
+        const least = head(keypoint, point);
+        return least + rests[keypoint] * theirs.rests[point] <= own || least + tail(keypoint, point) <= own;
+      });
+    });
   }
 
   /**
@@ -25,14 +52,14 @@ export class Matcher {
    *
    * Most points are ruled out by the first numbers of the turned descriptors: what the others can add to a product is
    * at most the product of their lengths. So this finds what all numbers would.
-   * @param {{count: number, descriptors: Float32Array}} features of the picture.
+   * @param {{count: number, turned: object}} features of `turned`.
    * @param {number} ratio of both distances, below which a match counts.
    * @returns {{keypoints: number[], points: number[]}}
    */
   match(features, ratio) {
     const matches = { keypoints: [], points: [] };
-    const { heads, tails, rests } = split(spectraOf(features.descriptors), this.#order);
-    const count = this.#points.rests.length;
+    const { heads, tails, rests } = features.turned;
+    const count = this.#atOnce;
     const sums = [new Float32Array(count), new Float32Array(count)];
     for (let keypoint = 0; keypoint < features.count; keypoint += 2) {
       const other = Math.min(keypoint + 1, features.count - 1);
@@ -103,20 +130,6 @@ export function matchNearby(features, visible, projected, descriptors, { radius,
     matches.points.push(point);
   }
   return matches;
-}
-
-/**
- * Rows of matches that are distinctive: no point in view is more similar to the keypoint than its own.
- * @param features of the picture.
- * @param {{keypoints: number[], points: number[], visible: number[]}} matches of {@link matchNearby}.
- * @param {Float32Array} descriptors of every point.
- */
-export function distinctiveOf(features, { keypoints, points, visible }, descriptors) {
-  const alike = (row, point) => product(features.descriptors, keypoints[row], descriptors, point, LENGTH);
-  return [...keypoints.keys()].filter((row) => {
-    const own = alike(row, points[row]);
-    return visible.every((point) => alike(row, point) <= own);
-  });
 }
 
 /** Euclidean distance of unit descriptors from their product. */
