@@ -19,7 +19,7 @@ _OFF_PX = 0.5
 _LEAST_CHANCE = 0.02
 _OCTAVES = 3.0  # of matches, or of the deviation, from lost to sure
 _UNSURE = 2.0  # times the matches that a pose needs: half of the frames that expect so many are found
-_MOST_DEVIATION = 0.03  # of the key frames' spread; localising itself asks for 0.04
+_MOST_DEVIATION = 0.03  # of the key frames' spread
 
 
 class Outlook:

@@ -10,6 +10,7 @@ import pytest
 from safetensors.numpy import load, save
 
 from mambaloc.errors import InputError
+from mambaloc.runtime.maps.acceptance import RULE
 from mambaloc.runtime.maps.sparse_map import VERSION, SparseMap
 
 
@@ -38,6 +39,12 @@ def test_a_map_comes_back_as_it_was(sparse_map, tmp_path):
         assert type(before) is type(after)
         np.testing.assert_array_equal(before, after)
     assert [file.name for file in path.parent.iterdir()] == ["map.safetensors"]
+
+
+def test_a_file_says_what_its_map_accepts(sparse_map, tmp_path):
+    sparse_map.save(tmp_path / "map.safetensors")
+    _, about = _parts(tmp_path / "map.safetensors")
+    assert (about["rule"], about["least_inliers"]) == (RULE, 12)
 
 
 def test_the_same_map_is_the_same_file(sparse_map, tmp_path):
