@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mambaloc.geometry import canonical, cropped_intrinsics, multiply, turn_towards
+from mambaloc.geometry import cropped_intrinsics
 from mambaloc.types import PoseBatch
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as torchvision and PIL
@@ -114,23 +114,3 @@ def centered(batch: PoseBatch, crop: tuple[int, int]) -> PoseBatch:
     corner = center_corner(batch.image, crop)
     intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, *corner)
     return replace(batch, image=center_crop(batch.image, crop), intrinsics=intrinsics)
-
-
-def turned(
-    quaternion: Tensor, image: Tensor, how: Augmentations, crop: tuple[int, int], focal_ratio: float | None
-) -> Tensor:
-    """Rotations of cameras that look at the middle of their crop, as an image's does at its centre crop's.
-
-    Args:
-        quaternion: true rotations, ``world_from_cam``, (B, 4).
-        image: the batch before it is cropped, (B, 3, H, W).
-        how: which crops are taken.
-        crop: height and width in pixels.
-        focal_ratio: focal length over the images' width; None leaves the rotations as they are.
-    """
-    if focal_ratio is None:
-        return quaternion
-    focal_px = focal_ratio * image.shape[-1]
-    top, left = center_corner(image, crop)
-    turn = turn_towards((how.left - left) / focal_px, (how.top - top) / focal_px)
-    return canonical(multiply(quaternion, turn))

@@ -1,6 +1,6 @@
 """Rotations, poses and cameras: torch only, conventions as in ``mambaloc.types``."""
 
-from mambaloc.geometry.cameras import cropped_intrinsics, project, resized_intrinsics, turn_towards
+from mambaloc.geometry.cameras import cropped_intrinsics, project, resized_intrinsics
 from mambaloc.geometry.poses import (
     compose,
     inverse,
@@ -44,5 +44,4 @@ __all__ = [
     "rotate",
     "rotation_error_deg",
     "transform",
-    "turn_towards",
 ]
