@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mambaloc.data.augmentation import Jitter, augment, augmentations, draw_uniforms
+from mambaloc.data.augmentation import Jitter, RandomCrop, draw_uniforms
 from mambaloc.data.datamodule import PoseDataModule
 from mambaloc.data.datasets import registry as datasets
 from mambaloc.errors import InputError
@@ -245,7 +245,9 @@ def test_resident_frames_give_the_same_batches_as_the_memory_map(make, clips):
 
 def gradient_batch() -> PoseBatch:
     image = torch.arange(16 * 21, dtype=torch.uint8).reshape(1, 1, 16, 21).repeat(4, 3, 1, 1)
-    return PoseBatch(image, torch.zeros(4, 3), torch.zeros(4, 4), torch.arange(4))
+    return PoseBatch(
+        image, torch.zeros(4, 3), torch.zeros(4, 4), torch.arange(4), intrinsics=torch.eye(3).repeat(4, 1, 1)
+    )
 
 
 @pytest.mark.parametrize("trainer", [None, SimpleNamespace(training=False, current_epoch=2)])
@@ -268,8 +270,9 @@ def test_training_batches_are_augmented_by_seed_epoch_and_index(make, monkeypatc
     module.setup("fit")
     module.trainer = SimpleNamespace(training=True, current_epoch=2)
     out = module.on_after_batch_transfer(batch, 0).image
-    how = augmentations(batch.image, (12, 14), Jitter(0.1, 0.2, 0.4), draw_uniforms(5, 2, 4))
-    assert torch.equal(out, augment(batch.image, how, (12, 14)))
+    chances = draw_uniforms(5, 2, 4, draws=5)
+    color = Jitter(0.1, 0.2, 0.4).matrices(batch.image, chances[:, 2:])
+    assert torch.equal(out, RandomCrop((12, 14))(batch, color, chances[:, :2]).image)
     assert not torch.equal(out[0], out[1])
     module.trainer.current_epoch = 3
     assert not torch.equal(module.on_after_batch_transfer(batch, 0).image, out)
