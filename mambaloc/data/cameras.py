@@ -112,7 +112,8 @@ def _of_rendering(folder: Path, told: Any) -> Floats:
         matrix = np.array(told, np.float64)
     except (ValueError, TypeError):
         matrix = np.empty(0)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+    is_pinhole = matrix.shape == (3, 3) and np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0
+    if not is_pinhole or not np.array_equal(matrix, _pinhole(matrix[0, 0], matrix[1, 1], *matrix[:2, 2])):
         raise InputError(
             f"{folder / SCENE_FILE}: intrinsics_px must be a 3x3 matrix 'fx 0 cx, 0 fy cy, 0 0 1' in pixels. "
             "Correct it, or render the scene again."

@@ -28,9 +28,10 @@ def test_a_rendered_scene_says_its_camera(scenes):
     np.testing.assert_allclose(found, np.repeat(default_intrinsics((96, 72))[None], 8, axis=0))
 
 
-@pytest.mark.parametrize(
-    "told", [None, 5, "wide", [[1, 0], [0, 1]], [[0, 0, 1], [0, 9, 1], [0, 0, 1]], [["a"] * 3] * 3]
-)
+SKEWED, FLAT = ([[9, 1, 4], [0, 9, 3], [0, 0, 1]], [[0, 0, 4], [0, 9, 3], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("told", [None, 5, "wide", [[1, 0], [0, 1]], FLAT, SKEWED, [["a"] * 3] * 3])
 def test_a_rendering_of_a_malformed_camera_is_refused(write_tiny_scene, told):
     folder = write_tiny_scene({1: 3}).folder
     (folder / "scene.json").write_text(json.dumps({"intrinsics_px": told}))
