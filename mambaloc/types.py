@@ -52,7 +52,7 @@ class PoseBatch:
         ``index`` (B,): the frame's row in its split, which names it in every report.
         ``clip_length``: so many successive rows are frames of one sequence, in time order; B is a multiple of it.
         ``points_m`` (B, P, 3): scene points that each frame may see, world frame, NaN where it has fewer than P.
-        ``intrinsics`` (B, 3, 3): pinhole matrices in pixels of ``image``, given with ``points_m``.
+        ``intrinsics`` (B, 3, 3): pinhole matrices in pixels of ``image``, no skew; the data module always gives them.
     """
 
     image: Tensor

@@ -1,71 +1,140 @@
-"""Crop and colour jitter of a whole batch, on whatever device it is on.
+"""Another view and other colours for each image of a training batch, on whatever device it is on.
 
-The paper's augmentation: random crop, brightness, contrast and saturation. Never a horizontal flip, which would show
-a place that does not exist. Each image's colour jitter is one 3x4 matrix, so it costs one product.
+A view is a crop, as in the paper, or what a camera turned about its centre sees; never a mirror image, which would show
+a place that does not exist. Colours vary in brightness, contrast and saturation: one 3x4 matrix an image, one product.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mambaloc.geometry import canonical, cropped_intrinsics, multiply, turn_towards
+from mambaloc.errors import InputError
+from mambaloc.geometry import (
+    canonical,
+    cropped_intrinsics,
+    matrix_from_quaternion,
+    multiply,
+    quaternion_from_log,
+    rotation_homography,
+    warped,
+)
 from mambaloc.types import PoseBatch
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as torchvision and PIL
+_MOST_DEG = 45.0
+
+View = Literal["crop", "rotation"]
 
 
 @dataclass(frozen=True)
 class Jitter:
     """How far colours vary: each factor is drawn uniformly from ``[1 - x, 1 + x]``."""
 
+    draws: ClassVar[int] = 3
+
     brightness: float = 0.3
     contrast: float = 0.3
     saturation: float = 0.3
 
+    def matrices(self, image: Tensor, uniform: Tensor) -> Tensor:
+        """Each image's affine map of RGB in 0..1; (B, 3, H, W) uint8, (B, 3) in [0, 1) -> (B, 3, 4)."""
+        brightness, contrast, saturation = (
+            1 - spread + 2 * spread * drawn
+            for spread, drawn in zip(
+                (self.brightness, self.contrast, self.saturation), uniform.unbind(dim=1), strict=True
+            )
+        )
+        means = image[..., ::4, ::4].float().mean((-2, -1)) / 255
+        luma_mean = sum((weight * mean for weight, mean in zip(_LUMA, means.unbind(-1), strict=True)), torch.zeros(()))
+        return color_matrices(brightness, contrast, saturation, luma_mean)
+
 
 @dataclass(frozen=True)
-class Augmentations:
-    """What happens to each image of a batch.
+class RandomCrop:
+    """A crop anywhere in the frame: the paper's augmentation.
 
-    Shape:
-        ``top`` and ``left`` (B,), the crop's corner in pixels; ``color`` (B, 3, 4), an affine map of RGB in 0..1.
-    """
-
-    top: Tensor
-    left: Tensor
-    color: Tensor
-
-
-def draw_uniforms(seed: int, epoch: int, frames: int) -> Tensor:
-    """Draw an epoch's chances, uniform in [0, 1), (frames, 5): a frame's depend on (seed, epoch, its row) alone."""
-    return torch.from_numpy(np.random.default_rng((seed, epoch)).random((frames, 5))).float()
-
-
-def augmentations(image: Tensor, crop: tuple[int, int], jitter: Jitter, uniform: Tensor) -> Augmentations:
-    """Say what happens to each image, without waiting for the device that it is on.
+    The pose stays the frame's, so that crops which look up to some degrees apart are asked for one rotation; their
+    intrinsics say where each lies.
 
     Args:
-        image: the batch, (B, 3, H, W) uint8.
-        crop: height and width in pixels.
-        jitter: the ranges of the colour factors.
-        uniform: each image's row of :func:`draw_uniforms`, (B, 5), on the images' device.
+        size: height and width in pixels.
     """
-    height, width = image.shape[-2:]
-    top, left = (
-        (uniform[:, axis] * places).long().clamp_(max=places - 1)  # float32 may round up to the very end
-        for axis, places in enumerate((height - crop[0] + 1, width - crop[1] + 1))
-    )
-    brightness, contrast, saturation = (
-        1 - spread + 2 * spread * uniform[:, axis]
-        for axis, spread in enumerate((jitter.brightness, jitter.contrast, jitter.saturation), start=2)
-    )
-    means = image[..., ::4, ::4].float().mean((-2, -1)) / 255
-    luma_mean = sum((weight * mean for weight, mean in zip(_LUMA, means.unbind(-1), strict=True)), torch.zeros(()))
-    return Augmentations(top, left, color_matrices(brightness, contrast, saturation, luma_mean))
+
+    draws: ClassVar[int] = 2
+
+    size: tuple[int, int]
+
+    def corners(self, image: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """Row and column of each crop's top-left pixel; (B, 3, H, W), (B, 2) in [0, 1) -> (B,) each."""
+        places = (image.shape[-2] - self.size[0] + 1, image.shape[-1] - self.size[1] + 1)
+        top, left = (
+            (uniform[:, axis] * count).long().clamp_(max=count - 1)  # float32 may round up to the very end
+            for axis, count in enumerate(places)
+        )
+        return top, left
+
+    def __call__(self, batch: PoseBatch, color: Tensor, uniform: Tensor) -> PoseBatch:
+        """Crop and colour a batch; ``image`` (B, 3, H, W) uint8 becomes (B, 3, *size) float32 in 0..1."""
+        top, left = self.corners(batch.image, uniform)
+        image = colored(_crops(batch.image, top, left, self.size), color)
+        return replace(batch, image=image, intrinsics=_cropped(batch, top, left))
+
+
+@dataclass(frozen=True)
+class RandomRotation:
+    """What a camera turned about its centre, and perhaps zoomed, sees of the frame: exact, black beyond its border.
+
+    The true pose is the turned camera's, and intrinsics are its own, so that nothing is asked for that the picture does
+    not show. Frames of a clip turn each on its own: poses of a clip relative to each other stay true.
+
+    Args:
+        size: height and width in pixels.
+        rotation_deg: each component of the rotation vector is uniform within this much of 0: pitch, yaw and roll.
+        zoom: focal lengths are scaled by a factor, log-uniform from ``1 / (1 + zoom)`` to ``1 + zoom``.
+
+    Raises:
+        InputError: for a number that is out of range.
+    """
+
+    draws: ClassVar[int] = 4
+
+    size: tuple[int, int]
+    rotation_deg: float = 10.0
+    zoom: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rotation_deg <= _MOST_DEG:
+            raise InputError(f"data.rotation_deg {self.rotation_deg:g}: must be more than 0, and {_MOST_DEG:g} at most")
+        if not 0 <= self.zoom < math.inf:
+            raise InputError(f"data.zoom {self.zoom:g}: must be 0 or more; 0 leaves focal lengths as they are")
+
+    def __call__(self, batch: PoseBatch, color: Tensor, uniform: Tensor) -> PoseBatch:
+        """Colour and turn a batch; ``image`` (B, 3, H, W) uint8 becomes (B, 3, *size) float32 in 0..1."""
+        assert batch.intrinsics is not None  # the data module always gives them
+        spread = 2 * uniform - 1
+        # A log-quaternion is half a rotation vector.
+        cam_from_turned = quaternion_from_log(spread[:, :3] * (math.radians(self.rotation_deg) / 2))
+        intrinsics = cropped_intrinsics(batch.intrinsics, *center_corner(batch.image, self.size))
+        scale = torch.exp(spread[:, 3] * math.log1p(self.zoom))
+        intrinsics[:, :2, :2] *= scale[:, None, None]
+        homography = rotation_homography(batch.intrinsics, matrix_from_quaternion(cam_from_turned), intrinsics)
+        return replace(
+            batch,
+            image=warped(colored(batch.image, color), homography, self.size),
+            quaternion=canonical(multiply(batch.quaternion, cam_from_turned)),
+            intrinsics=intrinsics,
+        )
+
+
+def draw_uniforms(seed: int, epoch: int, frames: int, draws: int) -> Tensor:
+    """Draw an epoch's chances, uniform in [0, 1), (frames, draws): a frame's depend on (seed, epoch, its row) alone."""
+    return torch.from_numpy(np.random.default_rng((seed, epoch)).random((frames, draws))).float()
 
 
 def color_matrices(brightness: Tensor, contrast: Tensor, saturation: Tensor, luma_mean: Tensor) -> Tensor:
@@ -84,18 +153,10 @@ def color_matrices(brightness: Tensor, contrast: Tensor, saturation: Tensor, lum
     return torch.cat((saturate_B33 * gain[:, None, None], offset[:, None, None].expand(-1, 3, 1)), dim=-1)
 
 
-def augment(image: Tensor, how: Augmentations, crop: tuple[int, int]) -> Tensor:
-    """Crop and colour a batch; (B, 3, H, W) uint8 -> (B, 3, *crop) float32 in 0..1."""
-    pixels = _crops(image, how.top, how.left, crop).flatten(2).float()
-    return torch.baddbmm(how.color[..., 3:], how.color[..., :3] / 255, pixels).clamp_(0, 1).unflatten(-1, crop)
-
-
-def _crops(image: Tensor, top: Tensor, left: Tensor, crop: tuple[int, int]) -> Tensor:
-    if image.device.type == "cpu":  # copying row by row takes a tenth of the time of the gather below
-        corners = zip(top.tolist(), left.tolist(), strict=True)
-        return torch.stack([i[:, y : y + crop[0], x : x + crop[1]] for i, (y, x) in zip(image, corners, strict=True)])
-    windows = image.unfold(2, crop[0], 1).unfold(3, crop[1], 1)  # (B, 3, tops, lefts, *crop), a view
-    return windows[torch.arange(len(image), device=image.device), :, top, left]
+def colored(image: Tensor, color: Tensor) -> Tensor:
+    """Map the colours of a batch; (B, 3, H, W) uint8, (B, 3, 4) -> (B, 3, H, W) float32 in 0..1."""
+    pixels = torch.baddbmm(color[..., 3:], color[..., :3] / 255, image.flatten(2).float())
+    return pixels.clamp_(0, 1).unflatten(-1, image.shape[-2:])
 
 
 def center_crop(image: Tensor, crop: tuple[int, int]) -> Tensor:
@@ -112,25 +173,16 @@ def center_corner(image: Tensor, crop: tuple[int, int]) -> tuple[int, int]:
 def centered(batch: PoseBatch, crop: tuple[int, int]) -> PoseBatch:
     """Take the middle of a batch's images, as :func:`center_crop`; intrinsics follow."""
     corner = center_corner(batch.image, crop)
-    intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, *corner)
-    return replace(batch, image=center_crop(batch.image, crop), intrinsics=intrinsics)
+    return replace(batch, image=center_crop(batch.image, crop), intrinsics=_cropped(batch, *corner))
 
 
-def turned(
-    quaternion: Tensor, image: Tensor, how: Augmentations, crop: tuple[int, int], focal_ratio: float | None
-) -> Tensor:
-    """Rotations of cameras that look at the middle of their crop, as an image's does at its centre crop's.
+def _cropped(batch: PoseBatch, top: Tensor | int, left: Tensor | int) -> Tensor | None:
+    return None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, top, left)
 
-    Args:
-        quaternion: true rotations, ``world_from_cam``, (B, 4).
-        image: the batch before it is cropped, (B, 3, H, W).
-        how: which crops are taken.
-        crop: height and width in pixels.
-        focal_ratio: focal length over the images' width; None leaves the rotations as they are.
-    """
-    if focal_ratio is None:
-        return quaternion
-    focal_px = focal_ratio * image.shape[-1]
-    top, left = center_corner(image, crop)
-    turn = turn_towards((how.left - left) / focal_px, (how.top - top) / focal_px)
-    return canonical(multiply(quaternion, turn))
+
+def _crops(image: Tensor, top: Tensor, left: Tensor, crop: tuple[int, int]) -> Tensor:
+    if image.device.type == "cpu":  # copying row by row takes a tenth of the time of the gather below
+        corners = zip(top.tolist(), left.tolist(), strict=True)
+        return torch.stack([i[:, y : y + crop[0], x : x + crop[1]] for i, (y, x) in zip(image, corners, strict=True)])
+    windows = image.unfold(2, crop[0], 1).unfold(3, crop[1], 1)  # (B, 3, tops, lefts, *crop), a view
+    return windows[torch.arange(len(image), device=image.device), :, top, left]

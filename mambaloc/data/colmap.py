@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.images import CORNER_PX
 
 COLMAP_FOLDERS = ("sparse/0", "sparse")
 """Where a scene's model lies, in the order it is looked for."""
@@ -73,6 +75,17 @@ def is_sound(camera: Any) -> bool:
     """Whether a ``pycolmap.Camera`` has a size and finite, positive focal lengths."""
     sizes = (camera.width, camera.height, camera.focal_length_x, camera.focal_length_y)
     return bool(np.isfinite(camera.params).all()) and min(sizes) > 0
+
+
+def pinhole_of(camera: Any, size_px: tuple[int, int]) -> NDArray[np.float64]:
+    """Intrinsics (3, 3) of a sound ``pycolmap.Camera`` in pixels of pictures of a size (width, height).
+
+    Of a distorted camera model the pinhole part is taken. COLMAP counts from the corner of the top-left pixel.
+    """
+    scale_x, scale_y = size_px[0] / camera.width, size_px[1] / camera.height
+    centre = (camera.principal_point_x * scale_x - CORNER_PX, camera.principal_point_y * scale_y - CORNER_PX)
+    focal = (camera.focal_length_x * scale_x, camera.focal_length_y * scale_y)
+    return np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
 
 
 def _is_whole(name: str, data: bytes) -> bool:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
-from functools import cached_property
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning as L
 import torch
@@ -14,20 +13,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler
 
 from mambaloc import provenance
-from mambaloc.data.augmentation import (
-    Jitter,
-    augment,
-    augmentations,
-    centered,
-    draw_uniforms,
-    turned,
-)
+from mambaloc.data.augmentation import Jitter, RandomCrop, RandomRotation, View, centered, draw_uniforms
 from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.frames import Frames, OnBadFrame, Split
 from mambaloc.data.scene import Scene
 from mambaloc.data.splits import Validation
 from mambaloc.errors import InputError
-from mambaloc.geometry import cropped_intrinsics
 from mambaloc.types import PoseBatch
 
 
@@ -49,10 +40,10 @@ class PoseDataModule(L.LightningDataModule):
         brightness: range of that jitter factor, ``[1 - x, 1 + x]``.
         contrast: likewise.
         saturation: likewise.
-        focal_ratio: focal length of the scene's cameras over their images' width, 0.914 for 7-Scenes; ``scene`` takes
-            an imported scene's own, where that is known and one for all. If given, the true rotation turns with each
-            random crop, as a camera that looks at the crop's middle would; otherwise, as the paper has it, the same
-            pose is asked of every crop, which are degrees apart.
+        augmentation: each training image's view. ``crop``, the paper's: a random crop, which is asked for the frame's
+            pose. ``rotation``: what a camera turned about its centre sees, whose pose is known exactly.
+        rotation_deg: under ``rotation``, turns are uniform within so much, about each of the camera's axes.
+        zoom: under ``rotation``, focal lengths vary from ``1 / (1 + zoom)`` to ``1 + zoom`` times the frame's.
         validation: how the best epoch is chosen, see :data:`~mambaloc.data.splits.Validation`; ``test_set`` selects on
             the test set and is reported as such.
         val_fraction: share of the training frames that is held out.
@@ -82,7 +73,9 @@ class PoseDataModule(L.LightningDataModule):
         brightness: float = 0.3,
         contrast: float = 0.3,
         saturation: float = 0.3,
-        focal_ratio: float | Literal["scene"] | None = None,
+        augmentation: View = "crop",
+        rotation_deg: float = 10.0,
+        zoom: float = 0.0,
         validation: Validation = "auto",
         val_fraction: float = 0.1,
         val_gap: int = 20,
@@ -101,13 +94,12 @@ class PoseDataModule(L.LightningDataModule):
         # LightningCLI has given what the recipe says; what is kept, and told, is what that means.
         self.hparams.update(dataset=self.scene.dataset, root=self.scene.root, scene=self.scene.scene)
         self.crop = self.scene.crop
-        is_bad = focal_ratio not in (None, "scene") and not (isinstance(focal_ratio, int | float) and focal_ratio > 0)
-        if is_bad or (focal_ratio is not None and points_per_frame > 0):
-            raise InputError(
-                f"data.focal_ratio {focal_ratio}: must be more than 0, and is not for scene points, whose intrinsics "
-                "follow the crop; leave it out, or say 'scene'"
-            )
         self.jitter = Jitter(brightness, contrast, saturation)
+        rotation = RandomRotation(self.crop, rotation_deg, zoom)
+        views: dict[str, RandomCrop | RandomRotation] = {"crop": RandomCrop(self.crop), "rotation": rotation}
+        if augmentation not in views:
+            raise InputError(f"data.augmentation {augmentation!r}: choose one of {', '.join(views)}")
+        self.augmentation = views[augmentation]
         self._resident: dict[Split, CachedFrames] = {}
         self._uniforms: tuple[tuple[int, int, torch.device], Tensor] | None = None
 
@@ -177,34 +169,29 @@ class PoseDataModule(L.LightningDataModule):
             size: frames a batch; ``eval_batch_size`` unless given.
         """
         loaded, size = self.scene.parts[part].data, size or self.hparams["eval_batch_size"]
-        frames = CachedFrames(loaded.frames, loaded.images, loaded.points)  # no clips
+        frames = CachedFrames(loaded.frames, loaded.images, loaded.cameras, loaded.points)  # no clips
         rows = range(len(frames)) if rows is None else rows
         for start in range(0, len(rows), size):
             yield centered(frames.__getitems__(list(rows[start : start + size])), self.crop)
 
     def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
-        """Crop and normalise on the device, jitter while training; intrinsics follow each image's crop."""
+        """Crop on the device; while training, augment. Intrinsics follow, and the pose where the camera turns."""
         if self.trainer is None or not self.trainer.training:
             return centered(batch, self.crop)
-        uniform = self._epoch_uniforms(self.trainer.current_epoch, batch.index.device)[batch.index]
-        how = augmentations(batch.image, self.crop, self.jitter, uniform)
-        image = augment(batch.image, how, self.crop)
-        quaternion = turned(batch.quaternion, batch.image, how, self.crop, self._focal_ratio)
-        intrinsics = None if batch.intrinsics is None else cropped_intrinsics(batch.intrinsics, how.top, how.left)
-        return replace(batch, image=image, quaternion=quaternion, intrinsics=intrinsics)
+        return self.augmented(batch, self.trainer.current_epoch)
 
-    @cached_property
-    def _focal_ratio(self) -> float | None:
-        """What ``focal_ratio`` comes to in this scene."""
-        if self.hparams["focal_ratio"] != "scene":
-            return self.hparams["focal_ratio"]
-        return self.scene.focal_ratio()
+    def augmented(self, batch: PoseBatch, epoch: int) -> PoseBatch:
+        """View and colour training images as chance has it, which depends on (seed, epoch, row) alone."""
+        uniform = self._epoch_uniforms(epoch, batch.index.device)[batch.index]
+        view, color = uniform.tensor_split([self.augmentation.draws], dim=1)
+        return self.augmentation(batch, self.jitter.matrices(batch.image, color), view)
 
     def _epoch_uniforms(self, epoch: int, device: torch.device) -> Tensor:
         """An epoch's chances of every training frame, drawn and sent to the device once."""
         drawn_for = (provenance.seed(), epoch, device)
         if self._uniforms is None or self._uniforms[0] != drawn_for:
-            uniforms = draw_uniforms(provenance.seed(), epoch, len(self.scene.parts["train"].data.frames))
+            frames, draws = len(self.scene.parts["train"].data.frames), self.augmentation.draws + self.jitter.draws
+            uniforms = draw_uniforms(provenance.seed(), epoch, frames, draws)
             self._uniforms = (drawn_for, uniforms.to(device))
         return self._uniforms[1]
 

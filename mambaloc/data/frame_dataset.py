@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +16,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mambaloc.data.cache import cached_frames
-from mambaloc.data.frames import BadFrames, Frames
+from mambaloc.data.frames import BadFrames, Cameras, Frames
 from mambaloc.data.points import ScenePoints
 from mambaloc.errors import InputError
 from mambaloc.geometry import resized_intrinsics
+from mambaloc.images import resized_size
 from mambaloc.types import PoseBatch
 
 
@@ -29,6 +30,7 @@ class CachedFrames(Dataset[PoseBatch]):
     Args:
         frames: N posed frames.
         images: the same, decoded: (N, 3, H, W).
+        cameras: of the frames.
         points: what each may see, if batches are to carry it.
         clips: the frames of each item, (C, length); each frame by itself unless given.
     """
@@ -37,20 +39,19 @@ class CachedFrames(Dataset[PoseBatch]):
         self,
         frames: Frames,
         images: NDArray[np.uint8],
+        cameras: Cameras,
         points: ScenePoints | None = None,
         clips: NDArray[np.int64] | None = None,
     ) -> None:
-        self.frames, self.images, self.points = frames, images, points
+        self.frames, self.images, self.cameras, self.points = frames, images, cameras, points
         self.resident: Tensor | None = None
         self.clips = np.arange(len(frames))[:, None] if clips is None else clips
         self.position_m = torch.from_numpy(frames.position_m).float()
         self.quaternion = torch.from_numpy(frames.quaternion).float()
-        self.points_m: Tensor | None = None
-        self.intrinsics: Tensor | None = None
-        if points:
-            scale_x, scale_y = images.shape[-1] / points.size_px[0], images.shape[-2] / points.size_px[1]
-            self.points_m = torch.from_numpy(points.points_m)
-            self.intrinsics = resized_intrinsics(torch.from_numpy(points.intrinsics), scale_x, scale_y)
+        width, height = torch.from_numpy(cameras.size_px).unbind(dim=1)
+        scale = (images.shape[-1] / width, images.shape[-2] / height)
+        self.intrinsics = resized_intrinsics(torch.from_numpy(cameras.intrinsics), *scale).float()
+        self.points_m = torch.from_numpy(points.points_m) if points else None
 
     def __len__(self) -> int:
         return len(self.clips)
@@ -77,7 +78,7 @@ class CachedFrames(Dataset[PoseBatch]):
             index,
             clip_length=self.clips.shape[1],
             points_m=None if self.points_m is None else self.points_m[index],
-            intrinsics=None if self.intrinsics is None else self.intrinsics[index],
+            intrinsics=self.intrinsics[index],
         )
 
 
@@ -91,19 +92,26 @@ class LoadedSplit:
 
 
 def load_split(
-    frames: Frames, bad: BadFrames, short_side: int, crop: tuple[int, int], cache_dir: str | None
+    frames: Frames,
+    bad: BadFrames,
+    cameras_of: Callable[[Frames], Cameras],
+    short_side: int,
+    crop: tuple[int, int],
+    cache_dir: str | None,
 ) -> LoadedSplit:
     """Decode the images of posed frames, once.
 
     Args:
         frames: to be decoded.
         bad: what to do with an image that cannot be.
+        cameras_of: the cameras of those that could be.
         short_side: what the shorter side of every image is resized to, in pixels.
         crop: height and width that will be taken of it.
         cache_dir: where decoded frames are kept; the user's cache folder unless given.
 
     Raises:
-        InputError: as :func:`~mambaloc.data.cache.cached_frames`, and for images that do not hold the crop.
+        InputError: as :func:`~mambaloc.data.cache.cached_frames`, for images that do not hold the crop, and for cameras
+            of pictures of another shape.
     """
     cache = cached_frames(frames.image_paths, short_side, bad, Path(cache_dir) if cache_dir else None)
     height, width = cache.images.shape[-2:]
@@ -113,8 +121,15 @@ def load_split(
             "choose a smaller (height, width), or enlarge data.short_side"
         )
     frames = frames.select(cache.rows)
+    cameras = cameras_of(frames)
+    for row, (wide, high) in enumerate(cameras.size_px.tolist()):
+        if resized_size((high, wide), short_side) != (height, width):
+            raise InputError(
+                f"{frames.image_paths[row]}: has another shape than its camera's {wide}x{high} pixels. "
+                "Give the intrinsics of this picture."
+            )
     fingerprint = hashlib.sha256(f"{cache.key} {frames.digest()}".encode()).hexdigest()
-    return LoadedSplit(CachedFrames(frames, cache.images), bad, fingerprint)
+    return LoadedSplit(CachedFrames(frames, cache.images, cameras), bad, fingerprint)
 
 
 def describe_points(parts: Mapping[Any, LoadedSplit]) -> dict[str, Any]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Literal
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +104,10 @@ class Frames:
         digest.update(self.quaternion.tobytes())
         return digest.hexdigest()
 
+    def rows_by_name(self, folder: Path) -> dict[str, int]:
+        """Rows by the name that a model in the scene's folder knows the images by: :func:`plain_name` of their path."""
+        return {plain_name(path.relative_to(folder).as_posix()): row for row, path in enumerate(self.image_paths)}
+
     def evenly_spread(self, most: int) -> list[int]:
         """Indices of at most so many frames, evenly spread from the first to the last."""
         return np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int).tolist()
@@ -112,3 +116,30 @@ class Frames:
         """Indices of each sequence's frames, in order of first appearance."""
         names = np.array(self.sequences)
         return {name: np.flatnonzero(names == name) for name in dict.fromkeys(self.sequences)}
+
+
+def plain_name(image: str) -> str:
+    """An image's path without suffix: models are made of ``.jpg`` where the dataset ships ``.png``."""
+    path = PurePosixPath(image.replace("\\", "/"))
+    return str(path.parent / path.stem)
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """The pinhole camera of each of N frames.
+
+    Shape:
+        ``intrinsics`` (N, 3, 3) float64, in pixels of pictures of ``size_px`` (N, 2): width and height.
+
+    Args:
+        is_assumed: the scene does not give its cameras, and a usual one is assumed.
+    """
+
+    intrinsics: NDArray[np.float64]
+    size_px: NDArray[np.int64]
+    is_assumed: bool = False
+
+    def describe(self) -> dict[str, Any]:
+        """The median focal length over the width, and whether it is an assumption."""
+        ratio = np.median(self.intrinsics[:, 0, 0] / self.size_px[:, 0])
+        return {"focal_ratio": round(float(ratio), 4), "assumed": self.is_assumed}

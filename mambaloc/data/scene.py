@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mambaloc import provenance
-from mambaloc.data.datasets.capture import CAPTURE, describe_capture, focal_ratio_of
+from mambaloc.data.cameras import known_or_assumed_cameras
+from mambaloc.data.datasets.capture import CAPTURE, describe_capture
 from mambaloc.data.datasets.registry import DATASETS, is_official, is_rendered, locate, scene_folder
 from mambaloc.data.frame_dataset import CachedFrames, LoadedSplit, describe_points, load_split
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
@@ -72,14 +74,6 @@ class Scene:
             InputError: for an unknown dataset, or a scene that is not there, with how to get it.
         """
         return scene_folder(self.dataset, Path(self.root) if self.root else None, self.scene)
-
-    def focal_ratio(self) -> float | None:
-        """Focal length of its cameras over their images' width, where an imported scene knows it and has one for all.
-
-        Raises:
-            InputError: for a malformed file.
-        """
-        return focal_ratio_of(self.folder) if self.dataset == CAPTURE else None
 
     def read(self, split: Split) -> Read:
         """Read the poses of a whole split, without decoding an image.
@@ -156,6 +150,7 @@ class Scene:
             "clip_skip": self.clip_skip,
             "image_size": list(self.crop),
             "short_side": self.short_side,
+            "cameras": {part: loaded.data.cameras.describe() for part, loaded in self.parts.items()},
             **describe_points(self.parts),
             **(describe_capture(self.folder) if self.dataset == CAPTURE else {}),
         }
@@ -171,15 +166,16 @@ class Scene:
         return None
 
     def _decode(self, frames: Frames, bad: BadFrames) -> LoadedSplit:
-        return load_split(frames, bad, self.short_side, self.crop, self.cache_dir)
+        cameras_of = partial(known_or_assumed_cameras, self.dataset, self.folder)
+        return load_split(frames, bad, cameras_of, self.short_side, self.crop, self.cache_dir)
 
     def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
         """Add what each frame may see, of the frames that could be decoded."""
         if self.points_per_frame == 0:
             return loaded
         data = loaded.data
-        points = read_points(self.folder, data.frames, self.points_per_frame, provenance.seed())
-        return replace(loaded, data=CachedFrames(data.frames, data.images, points))
+        points = read_points(self.folder, data.frames, data.cameras, self.points_per_frame, provenance.seed())
+        return replace(loaded, data=CachedFrames(data.frames, data.images, data.cameras, points))
 
     def _in_clips(self, loaded: LoadedSplit, thinned_by: float) -> LoadedSplit:
         """Make an item of each clip; neighbours of a thinned sequence lie farther apart already."""
@@ -187,4 +183,4 @@ class Scene:
             return loaded
         data = loaded.data
         clips = clips_of(data.frames, self.clip_length, max(1, round(self.clip_skip / thinned_by)))
-        return replace(loaded, data=CachedFrames(data.frames, data.images, data.points, clips))
+        return replace(loaded, data=CachedFrames(data.frames, data.images, data.cameras, data.points, clips))

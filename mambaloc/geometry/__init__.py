@@ -1,6 +1,7 @@
 """Rotations, poses and cameras: torch only, conventions as in ``mambaloc.types``."""
 
-from mambaloc.geometry.cameras import cropped_intrinsics, project, resized_intrinsics, turn_towards
+from mambaloc.geometry.cameras import cropped_intrinsics, project, resized_intrinsics
+from mambaloc.geometry.homographies import rotation_homography, warped
 from mambaloc.geometry.poses import (
     compose,
     inverse,
@@ -43,6 +44,7 @@ __all__ = [
     "resized_intrinsics",
     "rotate",
     "rotation_error_deg",
+    "rotation_homography",
     "transform",
-    "turn_towards",
+    "warped",
 ]

@@ -11,8 +11,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mambaloc.geometry.rotations import multiply
-
 
 def project(points_cam_m: Tensor, intrinsics: Tensor) -> Tensor:
     """Pixels that points in camera coordinates fall on; meaningless unless their depth, ``z``, is positive.
@@ -24,29 +22,18 @@ def project(points_cam_m: Tensor, intrinsics: Tensor) -> Tensor:
     return homogeneous[..., :2] / homogeneous[..., 2:]
 
 
-def turn_towards(x: Tensor, y: Tensor) -> Tensor:
-    """Turn a camera, about its y and then its x axis, so that it looks along the ray ``(x, y, 1)``.
-
-    Shape:
-        (...), (...) -> (..., 4), ``cam_from_turned``.
-    """
-    yaw = torch.atan(x)
-    pitch = -torch.atan(y * yaw.cos())
-    zero = torch.zeros_like(yaw)
-    about_y = torch.stack(((yaw / 2).cos(), zero, (yaw / 2).sin(), zero), dim=-1)
-    about_x = torch.stack(((pitch / 2).cos(), (pitch / 2).sin(), zero, zero), dim=-1)
-    return multiply(about_y, about_x)
-
-
-def resized_intrinsics(intrinsics: Tensor, scale_x: float, scale_y: float) -> Tensor:
+def resized_intrinsics(intrinsics: Tensor, scale_x: Tensor | float, scale_y: Tensor | float) -> Tensor:
     """Intrinsics of an image resized by a factor an axis: pixel centres lie half a pixel inside of the border.
 
     Shape:
-        (..., 3, 3) -> (..., 3, 3).
+        (..., 3, 3), (...) or a number each -> (..., 3, 3).
     """
-    shift_x, shift_y = (scale_x - 1) / 2, (scale_y - 1) / 2
-    resize = torch.tensor([[scale_x, 0, shift_x], [0, scale_y, shift_y], [0, 0, 1]])
-    return resize.to(intrinsics) @ intrinsics
+    resized = intrinsics.clone()
+    for axis, factor in enumerate((scale_x, scale_y)):
+        scale = torch.as_tensor(factor).to(intrinsics)
+        resized[..., axis, :] *= scale[..., None]
+        resized[..., axis, 2] += (scale - 1) / 2
+    return resized
 
 
 def cropped_intrinsics(intrinsics: Tensor, top: Tensor | int, left: Tensor | int) -> Tensor:
@@ -56,6 +43,6 @@ def cropped_intrinsics(intrinsics: Tensor, top: Tensor | int, left: Tensor | int
         (B, 3, 3), (B,) or a number each -> (B, 3, 3).
     """
     cropped = intrinsics.clone()
-    cropped[..., 0, 2] -= torch.as_tensor(left).to(intrinsics)
-    cropped[..., 1, 2] -= torch.as_tensor(top).to(intrinsics)
+    cropped[..., 0, 2] -= left
+    cropped[..., 1, 2] -= top
     return cropped

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from mambaloc.data import PoseDataModule
 
 
+_FORMER_AUGMENTATION = ("focal_ratio",)
+"""Arguments that ``PoseDataModule`` had: what a checkpoint is measured on does not depend on them."""
+
+
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
     """A training's checkpoint, read once.
@@ -51,6 +55,8 @@ class Checkpoint:
     def data(self, **changed: Any) -> PoseDataModule:
         """Build the data module of the training.
 
+        Arguments of earlier versions that only augmented training images are left out.
+
         Args:
             changed: arguments that replace the training's.
 
@@ -61,6 +67,8 @@ class Checkpoint:
 
         stored = self.stored.get("datamodule_hyper_parameters", {})
         arguments = {name: value for name, value in stored.items() if not name.startswith("_")}  # Lightning's notes
+        for name in _FORMER_AUGMENTATION:
+            arguments.pop(name, None)
         if not arguments:
             raise InputError(f"{self.path}: holds no data settings; train it with tools/train.py")
         return PoseDataModule(**{**arguments, **changed})

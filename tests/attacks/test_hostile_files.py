@@ -6,6 +6,7 @@ replaced by one that no file should hold.
 
 import json
 import shutil
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,12 +17,13 @@ from hypothesis import strategies as st
 
 from mambaloc.benchmark import Setting
 from mambaloc.cli import recipe_arguments
+from mambaloc.data.cameras import known_cameras, known_or_assumed_cameras
 from mambaloc.data.datasets import cambridge, seven_scenes
 from mambaloc.data.datasets import capture as capture_scene
 from mambaloc.data.download import download
 from mambaloc.data.frames import BadFrames
 from mambaloc.data.points import read_points
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import decode_image
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import read_capture
@@ -156,7 +158,8 @@ def test_points_of_a_model(tmp_path, fed):
     shots = shots_of_sequences(walks, test=(2,), image="seq{sequence}/frame{frame:05d}.png")
     folder = write_cambridge(tmp_path, "Yard", shots, size=(48, 36), points=True)
     frames = cambridge.read_split(folder, "train", BadFrames())
-    fed("NVM model", lambda path: read_points(path.parent, frames, 20, seed=0), folder / "reconstruction.nvm")
+    cameras = known_cameras("cambridge", folder, frames)
+    fed("NVM model", lambda path: read_points(path.parent, frames, cameras, 20, seed=0), folder / "reconstruction.nvm")
 
 
 @pytest.mark.parametrize("name", ["frames.csv", "scene.json"])
@@ -165,8 +168,9 @@ def test_imported_scenes(name, captured, tmp_path, fed):
     import_scene(captured, folder, split="block")
 
     def parse(_: Path) -> None:
-        capture_scene.read_split(folder, "train", BadFrames())
-        capture_scene.focal_ratio_of(folder)
+        frames = capture_scene.read_split(folder, "train", BadFrames())
+        with warnings.catch_warnings(action="ignore", category=InputWarning):
+            known_or_assumed_cameras("capture", folder, frames)
         capture_scene.describe_capture(folder)
 
     fed(f"imported scene's {name}", parse, folder / name)

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from mambaloc.data.augmentation import (
-    Augmentations,
-    Jitter,
-    augment,
-    augmentations,
-    center_crop,
-    color_matrices,
-    draw_uniforms,
-)
+from mambaloc.data.augmentation import Jitter, RandomCrop, center_crop, color_matrices, draw_uniforms
+from mambaloc.types import PoseBatch
 
 SIZE, CROP = (24, 32), (16, 20)
 
@@ -35,12 +30,28 @@ def indices(*rows: int) -> Tensor:
     return torch.tensor(rows)
 
 
-def drawn(image: Tensor, crop: tuple[int, int], jitter: Jitter, seed: int, epoch: int, rows: Tensor) -> Augmentations:
-    """What an epoch does to some of its frames."""
-    return augmentations(image, crop, jitter, draw_uniforms(seed, epoch, int(rows.max()) + 1)[rows])
+@dataclass(frozen=True)
+class Drawn:
+    """What an epoch does to some of its frames: each crop's corner (B,), each colour matrix (B, 3, 4)."""
+
+    top: Tensor
+    left: Tensor
+    color: Tensor
+    crop: RandomCrop
+    uniform: Tensor
 
 
-def factors_of(how: Augmentations, gray: float) -> np.ndarray:
+def drawn(image: Tensor, crop: tuple[int, int], jitter: Jitter, seed: int, epoch: int, rows: Tensor) -> Drawn:
+    uniform, view = draw_uniforms(seed, epoch, int(rows.max()) + 1, draws=5)[rows], RandomCrop(crop)
+    return Drawn(*view.corners(image, uniform[:, :2]), jitter.matrices(image, uniform[:, 2:]), view, uniform[:, :2])
+
+
+def augment(image: Tensor, how: Drawn) -> Tensor:
+    batch = PoseBatch(image, torch.zeros(len(image), 3), torch.zeros(len(image), 4), torch.arange(len(image)))
+    return how.crop(batch, how.color, how.uniform).image
+
+
+def factors_of(how: Drawn, gray: float) -> np.ndarray:
     """Solve brightness, contrast and saturation from the matrices drawn for images of one gray; (B, 3)."""
     color = how.color.double().numpy()
     both = color[:, 0, :3].sum(-1)  # rows of the saturation's part sum to one
@@ -71,7 +82,7 @@ def test_drawn_colors_are_torchvisions_on_the_whole_image():
     gray = torch.full_like(batch, 128)
     factors = factors_of(drawn(gray, CROP, Jitter(), 3, 4, rows), 128 / 255)
     how = drawn(batch, CROP, Jitter(), 3, 4, rows)
-    out = augment(batch, how, CROP)
+    out = augment(batch, how)
     for row, (brightness, contrast, saturation) in enumerate(factors.tolist()):
         expected = F.adjust_brightness(batch[row].float() / 255, brightness)
         expected = F.adjust_saturation(F.adjust_contrast(expected, contrast), saturation)
@@ -85,7 +96,7 @@ def test_drawn_colors_are_torchvisions_on_the_whole_image():
 def test_crop_is_a_slice():
     batch, rows = images(12), torch.arange(12)
     how = drawn(batch, CROP, Jitter(0, 0, 0), 0, 0, rows)
-    out = augment(batch, how, CROP)
+    out = augment(batch, how)
     assert out.shape == (12, 3, *CROP)
     assert out.dtype == torch.float32
     assert len({(t, s) for t, s in zip(how.top.tolist(), how.left.tolist(), strict=True)}) > 6
@@ -105,7 +116,7 @@ def test_every_place_of_the_crop_is_drawn_and_none_beyond():
 def test_a_crop_of_the_whole_image_stays_where_it_is():
     batch = images(3)
     how = drawn(batch, SIZE, Jitter(0, 0, 0), 0, 0, torch.arange(3))
-    np.testing.assert_allclose(augment(batch, how, SIZE).numpy(), batch.numpy() / 255, atol=1e-6)
+    np.testing.assert_allclose(augment(batch, how).numpy(), batch.numpy() / 255, atol=1e-6)
 
 
 def test_drawing_depends_on_seed_epoch_and_index_alone():
@@ -129,14 +140,14 @@ def test_another_seed_epoch_or_index_draws_otherwise(other):
 
 
 def test_an_epochs_chances_do_not_depend_on_how_many_frames_there_are():
-    assert torch.equal(draw_uniforms(1, 2, 100)[:7], draw_uniforms(1, 2, 7))
+    assert torch.equal(draw_uniforms(1, 2, 100, 5)[:7], draw_uniforms(1, 2, 7, 5))
 
 
 def test_the_largest_chance_still_crops_inside():
-    batch, uniform = images(1), torch.full((1, 5), 1 - 2**-24)
+    batch, uniform = images(1), torch.full((1, 2), 1 - 2**-24)
     for crop in ((1, 1), (16, 20), (23, 31), SIZE):
-        how = augmentations(batch, crop, Jitter(), uniform)
-        assert (how.top.item(), how.left.item()) == (SIZE[0] - crop[0], SIZE[1] - crop[1])
+        top, left = RandomCrop(crop).corners(batch, uniform)
+        assert (top.item(), left.item()) == (SIZE[0] - crop[0], SIZE[1] - crop[1])
 
 
 @pytest.mark.parametrize("jitter", [Jitter(), Jitter(0.1, 0.4, 0.0), Jitter(0.0, 0.2, 0.5)])
@@ -158,7 +169,7 @@ def test_an_image_is_never_mirrored():
     batch = torch.zeros(300, 3, *SIZE, dtype=torch.uint8)
     batch[..., 12:, :] += 60  # lower half
     batch[..., 16:] += 120  # right half
-    out = augment(batch, drawn(batch, CROP, Jitter(), 0, 0, torch.arange(300)), CROP).mean(1)
+    out = augment(batch, drawn(batch, CROP, Jitter(), 0, 0, torch.arange(300))).mean(1)
     assert (out[:, 0, -1] > out[:, 0, 0]).all()
     assert (out[:, -1, 0] > out[:, 0, 0]).all()
 
@@ -166,7 +177,7 @@ def test_an_image_is_never_mirrored():
 @pytest.mark.parametrize(("low", "high"), [(0, 1), (255, 256), (0, 256)])
 def test_values_stay_in_0_to_1(low, high):
     batch = images(32, low, high)
-    out = augment(batch, drawn(batch, CROP, Jitter(1.0, 1.0, 1.0), 0, 0, torch.arange(32)), CROP)
+    out = augment(batch, drawn(batch, CROP, Jitter(1.0, 1.0, 1.0), 0, 0, torch.arange(32)))
     assert out.min() >= 0
     assert out.max() <= 1
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,14 +10,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mambaloc.data.augmentation import Jitter, augment, augmentations, draw_uniforms
+from mambaloc.data.augmentation import Jitter, RandomCrop, draw_uniforms
 from mambaloc.data.datamodule import PoseDataModule
 from mambaloc.data.datasets import registry as datasets
 from mambaloc.errors import InputError
-from mambaloc.geometry import canonical
 from mambaloc.types import PoseBatch
 
 SEQUENCES = {1: 10, 2: 10, 3: 12, 4: 6}  # ids 0-9, 10-19, 20-31; test: 32-37
@@ -248,7 +245,9 @@ def test_resident_frames_give_the_same_batches_as_the_memory_map(make, clips):
 
 def gradient_batch() -> PoseBatch:
     image = torch.arange(16 * 21, dtype=torch.uint8).reshape(1, 1, 16, 21).repeat(4, 3, 1, 1)
-    return PoseBatch(image, torch.zeros(4, 3), torch.zeros(4, 4), torch.arange(4))
+    return PoseBatch(
+        image, torch.zeros(4, 3), torch.zeros(4, 4), torch.arange(4), intrinsics=torch.eye(3).repeat(4, 1, 1)
+    )
 
 
 @pytest.mark.parametrize("trainer", [None, SimpleNamespace(training=False, current_epoch=2)])
@@ -271,37 +270,12 @@ def test_training_batches_are_augmented_by_seed_epoch_and_index(make, monkeypatc
     module.setup("fit")
     module.trainer = SimpleNamespace(training=True, current_epoch=2)
     out = module.on_after_batch_transfer(batch, 0).image
-    how = augmentations(batch.image, (12, 14), Jitter(0.1, 0.2, 0.4), draw_uniforms(5, 2, 4))
-    assert torch.equal(out, augment(batch.image, how, (12, 14)))
+    chances = draw_uniforms(5, 2, 4, draws=5)
+    color = Jitter(0.1, 0.2, 0.4).matrices(batch.image, chances[:, 2:])
+    assert torch.equal(out, RandomCrop((12, 14))(batch, color, chances[:, :2]).image)
     assert not torch.equal(out[0], out[1])
     module.trainer.current_epoch = 3
     assert not torch.equal(module.on_after_batch_transfer(batch, 0).image, out)
-
-
-def test_rotations_turn_with_the_crop_where_the_focal_length_is_known(make):
-    """The crop's middle lies straight ahead of the turned camera: as OpenCV's pixel rays say, and SciPy's rotations."""
-    module = make(image_size=(12, 15), focal_ratio=0.8)
-    module.setup("fit")
-    quaternion = canonical(torch.randn(4, 4, generator=torch.Generator().manual_seed(0)))
-    batch = replace(gradient_batch(), quaternion=quaternion)
-    module.trainer = SimpleNamespace(training=True, current_epoch=0)
-    turned = module.on_after_batch_transfer(batch, 0).quaternion
-    how = augmentations(batch.image, (12, 15), module.jitter, draw_uniforms(0, 0, 4))
-    assert len({(top, left) for top, left in zip(how.top.tolist(), how.left.tolist(), strict=True)}) > 1
-    camera = np.array([[0.8 * 21, 0, 3 + 7], [0, 0.8 * 21, 2 + 5.5], [0, 0, 1]])  # the centre crop's middle is ahead
-    middles = np.stack([how.left + 7, how.top + 5.5], axis=-1).astype(float)
-    rays = np.column_stack((cv2.undistortPoints(middles[:, None], camera, None)[:, 0], np.ones(4)))
-    expected = Rotation.from_quat(quaternion.numpy(), scalar_first=True).apply(rays)
-    ahead = Rotation.from_quat(turned.numpy(), scalar_first=True).apply([0, 0, 1])
-    np.testing.assert_allclose(ahead, expected / np.linalg.norm(expected, axis=-1, keepdims=True), atol=1e-6)
-    module.trainer.training = False
-    assert torch.equal(module.on_after_batch_transfer(batch, 0).quaternion, quaternion)
-
-
-@pytest.mark.parametrize("options", [{"focal_ratio": 0.0}, {"focal_ratio": 0.9, "points_per_frame": 5}])
-def test_a_focal_length_that_cannot_be_used(make, options):
-    with pytest.raises(InputError, match=r"data\.focal_ratio .*: must be more than 0, and is not for scene points"):
-        make(**options)
 
 
 @pytest.mark.parametrize(

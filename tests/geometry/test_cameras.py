@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
-from mambaloc.geometry import cropped_intrinsics, inverse, project, resized_intrinsics, transform, turn_towards
+from mambaloc.geometry import cropped_intrinsics, inverse, project, resized_intrinsics, transform
 from mambaloc.types import Pose
 
 K = torch.tensor([[585.0, 0, 320], [0, 570, 240], [0, 0, 1]], dtype=torch.float64)
@@ -90,14 +90,3 @@ def test_a_pixel_of_the_big_image_maps_into_the_resized_crop():
     small = cropped_intrinsics(resized_intrinsics(K[None], 0.5, 0.5), 8, 20)[0]
     ray = torch.linalg.inv(K) @ torch.tensor([301.0, 155.0, 1], dtype=torch.float64)
     torch.testing.assert_close(project(ray, small), torch.tensor([130.25, 69.25], dtype=torch.float64))
-
-
-def test_a_camera_turns_towards_a_ray():
-    x, y = torch.randn(2, 50, generator=torch.Generator().manual_seed(0)).double()
-    turned = Rotation.from_quat(turn_towards(x, y).numpy(), scalar_first=True)
-    ahead = np.stack([x, y, np.ones(50)], axis=-1)
-    np.testing.assert_allclose(
-        turned.apply([0, 0, 1]), ahead / np.linalg.norm(ahead, axis=-1, keepdims=True), atol=1e-12
-    )
-    assert np.abs(turned.apply([1, 0, 0])[:, 1]).max() < 1e-12  # it does not roll: rows stay level
-    torch.testing.assert_close(turn_towards(torch.zeros(1), torch.zeros(1)), torch.tensor([[1.0, 0, 0, 0]]))

@@ -59,6 +59,15 @@ def test_the_data_is_that_of_the_recipe(best, trained):
         without.data()
 
 
+def test_arguments_of_earlier_versions_do_not_matter_where_they_only_augmented(best):
+    stored = best.stored["datamodule_hyper_parameters"]
+    older = replace(best, stored={**best.stored, "datamodule_hyper_parameters": {**stored, "focal_ratio": 0.914}})
+    assert dict(older.data().hparams) == dict(best.data().hparams)
+    unknown = replace(best, stored={**best.stored, "datamodule_hyper_parameters": {**stored, "zoo": 1}})
+    with pytest.raises(TypeError, match="zoo"):
+        unknown.data()
+
+
 def test_how_the_epoch_was_chosen(best, trained):
     assert best.selection == "best: lowest val/loss on frames held out of training"
     assert Checkpoint.read(trained / "checkpoints/last.ckpt").selection == "last"

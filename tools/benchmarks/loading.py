@@ -1,6 +1,6 @@
 """Measure frames from the decode-once cache against decoding every frame every epoch, on one core.
 
-python tools/benchmarks/loading.py [--dataset NAME] [--root FOLDER] [--scene NAME]
+python tools/benchmarks/loading.py [--dataset NAME] [--root FOLDER] [--scene NAME] [--augmentation rotation]
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from mambaloc import provenance
 from mambaloc.benchmark.reference import DecodedFrames
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
-from mambaloc.data.augmentation import augment, augmentations, draw_uniforms
 from mambaloc.memory import keep_freed_memory
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -44,10 +43,10 @@ def main() -> None:
     """Measure a scene and print."""
     quieten()
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
-        parser.add_argument(name, default=default)
-    args = parser.parse_args()
-    print_loading(measure_loading(PoseDataModule(args.dataset, args.root, args.scene)), provenance.machine())
+    options = {"dataset": "embedded", "root": None, "scene": "heads", "augmentation": "crop"}
+    for name, default in options.items():
+        parser.add_argument(f"--{name}", default=default)
+    print_loading(measure_loading(PoseDataModule(**vars(parser.parse_args()))), provenance.machine())
 
 
 def measure_loading(data: PoseDataModule, batches: int = 32, repetitions: int = 5) -> LoadingRates:
@@ -98,12 +97,10 @@ def _images_per_second(load: Callable[[list[int]], Tensor], batch_size: int, bat
 def _cached(data: PoseDataModule) -> Callable[[list[int]], Tensor]:
     frames = data.train_dataloader().dataset
     mean, std = (torch.tensor(values).view(3, 1, 1) for values in (_MEAN, _STD))
-    uniforms = draw_uniforms(0, 0, len(data.frames("train")))
 
     def load(indices: list[int]) -> Tensor:
         batch = frames.__getitems__(indices)  # type: ignore[attr-defined]
-        how = augmentations(batch.image, data.crop, data.jitter, uniforms[batch.index])
-        return augment(batch.image, how, data.crop).sub_(mean).div_(std)
+        return data.augmented(batch, epoch=0).image.sub_(mean).div_(std)
 
     return load
 

@@ -19,7 +19,6 @@ from mambaloc.data.datasets.dataset import Dataset
 from mambaloc.data.frames import FARTHEST, UNIT_TOLERANCE, BadFrames, Frames, Split
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
-from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.runtime.rotations import canonical
 
 CAPTURE = "capture"
@@ -31,7 +30,6 @@ COLUMNS = ("image", "sequence", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz",
 SPLITS = ("train", "val", "test", "unused")
 
 MOST_FRAMES = 200_000
-_SAME_RATIO = 0.05
 _MEND = "import the scene again"
 
 
@@ -123,23 +121,6 @@ def read_rows(folder: Path) -> list[Row]:
     return rows
 
 
-def focal_ratio_of(folder: Path) -> float | None:
-    """Focal length of the training frames' cameras over their images' width; None where they are unknown or differ.
-
-    Raises:
-        InputError: for a malformed file.
-    """
-    cameras = {name: _focal_ratio(folder, name, told) for name, told in _cameras(folder).items()}
-    named = {row.camera for row in read_rows(folder) if row.split == "train"}
-    if unknown := sorted(named - {"", *cameras}):
-        raise InputError(f"{folder / SCENE_FILE}: has no camera {unknown[0]!r}, which frames.csv names; {_MEND}")
-    if not named or "" in named:
-        return None
-    ratios = [cameras[name] for name in named]
-    middle = float(np.median(ratios))
-    return middle if max(ratios) - min(ratios) <= _SAME_RATIO * middle else None
-
-
 def describe_capture(folder: Path) -> dict[str, Any]:
     """What an imported scene says of itself that a result must tell: its unit, where it is from, how it was split."""
     told = read_scene(folder)
@@ -152,23 +133,6 @@ def _usable(folder: Path) -> None:
     verdict = sanity.get("verdict") if isinstance(sanity, dict) else None
     if isinstance(verdict, str) and verdict.startswith("not usable"):
         raise InputError(f"{folder}: was found {verdict[:400]}; see report.md there, and {_MEND}")
-
-
-def _cameras(folder: Path) -> dict[str, Any]:
-    cameras = read_scene(folder).get("cameras")
-    if not isinstance(cameras, dict) or len(cameras) > MOST_FRAMES:
-        raise InputError(f"{folder / SCENE_FILE}: has no 'cameras', or too many; {_MEND}")
-    return cameras
-
-
-def _focal_ratio(folder: Path, name: str, told: Any) -> float:
-    try:
-        width, focal_px = float(told["width"]), float(told["focal_px"][0])
-    except (TypeError, ValueError, KeyError, IndexError, OverflowError):
-        width = focal_px = math.nan
-    if not (1 <= width <= LARGEST_SIDE_PX and 0 < focal_px < math.inf):
-        raise InputError(f"{folder / SCENE_FILE}: camera {name!r} has no width and focal length in pixels; {_MEND}")
-    return focal_px / width
 
 
 def _table(path: Path) -> Iterator[tuple[int, dict[str, str]]]:

@@ -1,7 +1,6 @@
 """Scene points from a COLMAP model in ``SCENE/sparse/0`` or ``SCENE/sparse``, text or binary.
 
-Images are named by their path in the scene's folder, with whatever suffix. Of a distorted camera model the pinhole part
-is taken: focal lengths and principal point, which COLMAP counts from the corner of the top-left pixel.
+Images are named by their path in the scene's folder, with whatever suffix.
 """
 
 from __future__ import annotations
@@ -14,13 +13,12 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, is_sound, load_colmap
-from mambaloc.data.frames import Frames
-from mambaloc.data.points.reconstructions import Reconstruction, plain_name, points_of_frames, rows_by_name
+from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, load_colmap
+from mambaloc.data.frames import Frames, plain_name
+from mambaloc.data.points.reconstructions import Reconstruction, points_of_frames
 from mambaloc.data.points.scene_points import ScenePoints
 from mambaloc.errors import InputError
-from mambaloc.geometry import quaternion_from_matrix, resized_intrinsics
-from mambaloc.images import CORNER_PX
+from mambaloc.geometry import quaternion_from_matrix
 
 
 def read_colmap_points(folder: Path, frames: Frames, count: int, seed: int) -> ScenePoints:
@@ -35,22 +33,17 @@ def read_colmap_points(folder: Path, frames: Frames, count: int, seed: int) -> S
         raise InputError(
             f"{folder / COLMAP_FOLDERS[0]}: holds no COLMAP model; put its cameras, images, points3D there"
         )
-    rows = rows_by_name(folder, frames)
+    rows = frames.rows_by_name(folder)
     model = load_colmap(path)
     images = [image for image in model.images.values() if image.has_pose and plain_name(image.name) in rows]
-    cameras = [model.cameras[image.camera_id] for image in images]
-    if not all(is_sound(camera) for camera in cameras):
-        raise InputError(f"{path}: holds a camera without a size or a finite, positive focal length; export it again")
-    size = (int(cameras[0].width), int(cameras[0].height)) if cameras else (1, 1)
     cam_from_world = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
     known = Reconstruction(
         np.array([rows[plain_name(image.name)] for image in images], dtype=np.int64),
         np.array([image.projection_center() for image in images]).reshape(-1, 3),
         quaternion_from_matrix(torch.from_numpy(cam_from_world[:, :, :3].transpose(0, 2, 1).copy())).numpy(),
-        np.array([_pinhole(camera, size) for camera in cameras]).reshape(-1, 3, 3),
         [_observed(model, image) for image in track(images, "Reading points", transient=True)],
     )
-    return points_of_frames(known, path, frames, count, seed, size, "colmap")
+    return points_of_frames(known, path, frames, count, seed, "colmap")
 
 
 def _observed(model: Any, image: Any) -> NDArray[np.float64]:
@@ -58,11 +51,3 @@ def _observed(model: Any, image: Any) -> NDArray[np.float64]:
     ids = [point.point3D_id for point in image.get_observation_points2D()]
     points = [model.points3D[number].xyz for number in ids if model.exists_point3D(number)]
     return np.array(points, dtype=np.float64).reshape(-1, 3)
-
-
-def _pinhole(camera: Any, size: tuple[int, int]) -> NDArray[np.float64]:
-    """A camera's pinhole matrix in pixels of images of a size (width, height), (3, 3)."""
-    focal, centre = (camera.focal_length_x, camera.focal_length_y), (camera.principal_point_x, camera.principal_point_y)
-    matrix = np.array([[focal[0], 0, centre[0] - CORNER_PX], [0, focal[1], centre[1] - CORNER_PX], [0, 0, 1]])
-    scale = (size[0] / camera.width, size[1] / camera.height)
-    return resized_intrinsics(torch.from_numpy(matrix), *scale).numpy()

@@ -1,8 +1,9 @@
 """Scene points from depth frames: ``frame-NNNNNN.depth.png`` beside the images, as 7-Scenes lays them out.
 
-A depth frame holds ``uint16`` millimetres along the optical axis; 0 and 65535 are pixels without a measurement. The
+A depth frame holds ``uint16`` millimetres along the optical axis; 0 and 65535 are pixels without a measurement. Its
 camera is ``SCENE/camera-intrinsics.txt`` (3x3, pixels of the depth frames) or, without such a file, the official depth
-camera. Colour and depth are taken as one camera, as every user of 7-Scenes does who does not register them.
+sensor, whose view is narrower than the colour camera's: 585 px where that has 525. Both are taken to be in one place
+and to look one way; they are 25 mm apart.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from mambaloc.data.frames import Frames
+from mambaloc.data.frames import Cameras, Frames
 from mambaloc.data.points.scene_points import Points, ScenePoints, choose, frame_rng, stacked
 from mambaloc.errors import InputError
 from mambaloc.geometry import inverse, project, resized_intrinsics, transform
@@ -39,7 +40,7 @@ def depth_rows(frames: Frames) -> list[int]:
     return [row for row, image in enumerate(frames.image_paths) if depth_path(image).is_file()]
 
 
-def read_depth_points(folder: Path, frames: Frames, count: int, seed: int) -> ScenePoints:
+def read_depth_points(folder: Path, frames: Frames, cameras: Cameras, count: int, seed: int) -> ScenePoints:
     """Draw pixels of each frame's depth and carry them to the world by the frame's true pose.
 
     A frame without depth of its own gets the points of its sequence's nearest depth frames, one before and one after,
@@ -48,6 +49,7 @@ def read_depth_points(folder: Path, frames: Frames, count: int, seed: int) -> Sc
     Args:
         folder: the scene's.
         frames: the frames asked for, of which one at least has depth.
+        cameras: of their pictures.
         count: points a frame, P.
         seed: of the draw.
 
@@ -64,10 +66,9 @@ def read_depth_points(folder: Path, frames: Frames, count: int, seed: int) -> Sc
             points[row] = sample
     lenders = _lenders(frames, rows)
     for row, lent_by in track(lenders.items(), "Sharing points", transient=True):
-        lent = _in_view(np.concatenate([points[lender] for lender in lent_by]), frames, row, intrinsics, size)
+        lent = _in_view(np.concatenate([points[lender] for lender in lent_by]), frames, cameras, row)
         points[row] = choose(lent, count, frame_rng(seed, frames.image_paths[row]))
-    cameras = np.tile(intrinsics.astype(np.float32), (len(frames), 1, 1))
-    return ScenePoints(stacked(points, count), cameras, size, "depth")
+    return ScenePoints(stacked(points, count), "depth")
 
 
 def read_depth_mm(path: Path) -> NDArray[np.uint16]:
@@ -142,14 +143,12 @@ def _lenders(frames: Frames, rows: list[int]) -> dict[int, NDArray[np.int64]]:
     return lenders
 
 
-def _in_view(
-    points_m: Points, frames: Frames, row: int, intrinsics: NDArray[np.float64], size: tuple[int, int]
-) -> Points:
-    """Those of the points that lie in front of a frame's camera and project into its image."""
+def _in_view(points_m: Points, frames: Frames, cameras: Cameras, row: int) -> Points:
+    """Those of the points that lie in front of a frame's camera and project into its picture."""
     cam_from_world = inverse(_pose(frames, row))
     points_cam = transform(cam_from_world, torch.from_numpy(points_m))
-    pixels = project(points_cam, torch.from_numpy(intrinsics)).numpy()
-    inside = ((pixels >= -0.5) & (pixels < np.array(size) - 0.5)).all(axis=1)
+    pixels = project(points_cam, torch.from_numpy(cameras.intrinsics[row])).numpy()
+    inside = ((pixels >= -0.5) & (pixels < cameras.size_px[row] - 0.5)).all(axis=1)
     return points_m[inside & (points_cam[:, 2] > 0).numpy()]
 
 

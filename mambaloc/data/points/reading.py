@@ -5,20 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 
 from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder
-from mambaloc.data.frames import Frames
+from mambaloc.data.frames import Cameras, Frames
+from mambaloc.data.nvm import NVM_FILE
 from mambaloc.data.points.colmap import read_colmap_points
 from mambaloc.data.points.depth import depth_path, depth_rows, read_depth_points
-from mambaloc.data.points.nvm import NVM_FILE, read_nvm_points
+from mambaloc.data.points.nvm import read_nvm_points
 from mambaloc.data.points.scene_points import ScenePoints
 from mambaloc.errors import InputError
 
 
-def read_points(folder: Path, frames: Frames, count: int, seed: int) -> ScenePoints:
+def read_points(folder: Path, frames: Frames, cameras: Cameras, count: int, seed: int) -> ScenePoints:
     """Read scene points that frames may see.
 
     Args:
         folder: the scene's.
         frames: the frames asked for, N of them with readable images.
+        cameras: of these.
         count: points a frame, P; where there are more, a draw that depends on the seed and the frame's name alone.
         seed: of the draw.
 
@@ -29,7 +31,7 @@ def read_points(folder: Path, frames: Frames, count: int, seed: int) -> ScenePoi
         InputError: where there is no source of points, it is malformed, or no frame has any point.
     """
     if depth_rows(frames):
-        points = read_depth_points(folder, frames, count, seed)
+        points = read_depth_points(folder, frames, cameras, count, seed)
     elif (folder / NVM_FILE).is_file():
         points = read_nvm_points(folder, frames, count, seed)
     elif colmap_folder(folder):

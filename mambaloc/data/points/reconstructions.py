@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -25,29 +25,17 @@ class Reconstruction:
 
     Shape:
         ``rows`` (M,), each camera's row among the frames; ``position_m`` (M, 3) and ``quaternion`` (M, 4), its
-        ``world_from_cam``; ``intrinsics`` (M, 3, 3); ``points_m`` holds M arrays (K, 3).
+        ``world_from_cam``; ``points_m`` holds M arrays (K, 3).
     """
 
     rows: NDArray[np.int64]
     position_m: NDArray[np.float64]
     quaternion: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
     points_m: Sequence[Points]
 
 
-def rows_by_name(folder: Path, frames: Frames) -> dict[str, int]:
-    """Rows of frames by the name that a model knows them by: :func:`plain_name` of the path in the scene's folder."""
-    return {plain_name(path.relative_to(folder).as_posix()): row for row, path in enumerate(frames.image_paths)}
-
-
-def plain_name(image: str) -> str:
-    """An image's path without suffix: models are made of ``.jpg`` where the dataset ships ``.png``."""
-    path = PurePosixPath(image.replace("\\", "/"))
-    return str(path.parent / path.stem)
-
-
 def points_of_frames(
-    model: Reconstruction, file: Path, frames: Frames, count: int, seed: int, size_px: tuple[int, int], source: Source
+    model: Reconstruction, file: Path, frames: Frames, count: int, seed: int, source: Source
 ) -> ScenePoints:
     """Each frame's points, at most ``count``. A frame that the model does not know, or knows in another pose, has none.
 
@@ -61,15 +49,13 @@ def points_of_frames(
         )
     agrees = _agrees(model, file, frames)
     points: list[Points] = [np.empty((0, 3))] * len(frames)
-    intrinsics = np.tile(np.median(model.intrinsics, axis=0), (len(frames), 1, 1))
     for camera in np.flatnonzero(agrees).tolist():
         row = model.rows[camera]
-        intrinsics[row] = model.intrinsics[camera]
         seen = model.points_m[camera]
         # Points farther from the world's origin are triangulated from nearly parallel rays.
         near = seen[np.abs(seen).max(axis=1, initial=0) <= FARTHEST_M]
         points[row] = choose(near, count, frame_rng(seed, frames.image_paths[row]))
-    return ScenePoints(stacked(points, count), intrinsics.astype(np.float32), size_px, source)
+    return ScenePoints(stacked(points, count), source)
 
 
 def _agrees(model: Reconstruction, file: Path, frames: Frames) -> NDArray[np.bool_]:

@@ -17,16 +17,13 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ScenePoints:
-    """Scene points that each of N frames may see, and the cameras that see them.
+    """Scene points that each of N frames may see.
 
     Shape:
         ``points_m`` (N, P, 3) float32: world frame, NaN where a frame has fewer than P.
-        ``intrinsics`` (N, 3, 3) float32: pinhole matrices in pixels of images of ``size_px``, (width, height).
     """
 
     points_m: NDArray[np.float32]
-    intrinsics: NDArray[np.float32]
-    size_px: tuple[int, int]
     source: Source
 
     def per_frame(self) -> NDArray[np.int64]:

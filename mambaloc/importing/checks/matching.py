@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from mambaloc.data.cameras import assumed_intrinsics
 from mambaloc.images import Image, read_image
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.motion import Motion, apart, quaternions
@@ -33,7 +34,6 @@ _OFFSETS = (32, 24, 16, 12, 8, 6, 4, 3, 2, 1)  # frames from one of a pair to th
 _MOST_TURNS_DEG = (8.0, 15.0)
 _LEAST_MOVE = 0.01  # of the extent; turned on the spot, a camera draws no lines
 _MOST_FRAMES = 32  # that pairs by pose are chosen from
-_GUESSED_FOCAL = 0.85  # of the longer side, as a phone's
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Matches:
     Args:
         pairs: neighbours in time come first.
         neighbours: how many pairs are.
-        is_guessed: the focal length is a guess, since the format does not give one.
+        is_guessed: the focal length is assumed, since the format does not give one.
     """
 
     pairs: Indices
@@ -135,14 +135,12 @@ def searched(capture: Capture, row: int) -> Features:
 
 
 def intrinsics(capture: Capture, row: int, image: Image | None = None) -> Floats:
-    """The pinhole matrix of a frame, (3, 3), in pixels of its picture; a guess where the format gives none."""
+    """The pinhole matrix of a frame, (3, 3), in pixels of its picture; an assumed one where the format gives none."""
     if capture.camera_of is None:
         height, width = (read_image(capture.images[row]) if image is None else image).shape[:2]
-        focal_px = (_GUESSED_FOCAL * max(height, width),) * 2
-        centre_px = ((width - 1) / 2, (height - 1) / 2)
-    else:
-        camera = capture.cameras[capture.camera_of[row]]
-        focal_px, centre_px = camera.focal_px, camera.centre_px
+        return assumed_intrinsics((width, height))
+    camera = capture.cameras[capture.camera_of[row]]
+    focal_px, centre_px = camera.focal_px, camera.centre_px
     return np.array([[focal_px[0], 0, centre_px[0]], [0, focal_px[1], centre_px[1]], [0, 0, 1]])
 
 

@@ -8,11 +8,10 @@ import re
 import cv2
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from mambaloc.data import PoseDataModule
-from mambaloc.data.datasets.capture import COLUMNS, focal_ratio_of, is_captured, read_rows, read_split
+from mambaloc.data.datasets.capture import COLUMNS, is_captured, read_rows, read_split
 from mambaloc.data.datasets.registry import licence_of_weights, locate, scene_folder
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
@@ -163,39 +162,6 @@ def test_a_split_without_frames(scene):
         read_split(scene, "test", BadFrames())
 
 
-# --- cameras ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_focal_length_of_training_frames(scene):
-    assert focal_ratio_of(scene) == 28 / 32
-    phone = {"width": 32, "height": 24, "focal_px": [28.0, 28.0]}
-    edit(scene, cameras={"phone": phone, "other": {**phone, "focal_px": [20.0, 20.0]}})
-    edit_row(scene, 12, "camera", "other")  # a test frame's camera is none of training's
-    assert focal_ratio_of(scene) == 28 / 32
-    edit_row(scene, 0, "camera", "other")
-    assert focal_ratio_of(scene) is None
-    edit_row(scene, 0, "camera", "")
-    assert focal_ratio_of(scene) is None
-
-
-@pytest.mark.parametrize(
-    ("cameras", "message"),
-    [
-        ([], "has no 'cameras'"),
-        ({}, "has no camera 'phone'"),
-        ({"phone": {"width": 32}}, "camera 'phone' has no width and focal length"),
-        ({"phone": {"width": 1e12, "focal_px": [28, 28]}}, "camera 'phone' has no width and focal length"),
-        ({"phone": {"width": 32, "focal_px": [-28, 28]}}, "camera 'phone' has no width and focal length"),
-        ({"phone": {"width": 32, "focal_px": "wide"}}, "camera 'phone' has no width and focal length"),
-        ({"phone": 5}, "camera 'phone' has no width and focal length"),
-    ],
-)
-def test_a_camera_that_is_none(scene, cameras, message):
-    edit(scene, cameras=cameras)
-    with pytest.raises(InputError, match=re.escape(message)):
-        focal_ratio_of(scene)
-
-
 # --- as a dataset ----------------------------------------------------------------------------------------------------
 
 
@@ -283,20 +249,10 @@ def test_a_bad_validation_image_is_skipped_and_counted(scene, tmp_path):
     assert data.describe()["skipped"]["val"] == {"image cannot be decoded": 1}
 
 
-def test_crops_turn_by_the_scenes_own_focal_length(scene, tmp_path):
-    """Asked of the scene, as if its number had been given; where it is not known, nothing turns."""
-
-    def turned(**values):
-        data = module(scene, tmp_path, validation="none", batch_size=6, **values)
-        data.setup("fit")
-        data.trainer = type("Trainer", (), {"training": True, "current_epoch": 0, "world_size": 1, "global_rank": 0})()
-        batch = data.scene.parts["train"].data.__getitems__(list(range(6)))
-        return data.on_after_batch_transfer(batch, 0).quaternion, batch.quaternion
-
-    asked, plain = turned(focal_ratio="scene")
-    torch.testing.assert_close(asked, turned(focal_ratio=28 / 32)[0])
-    assert not torch.allclose(asked, plain)
-    edit_row(scene, 0, "camera", "")
-    torch.testing.assert_close(*turned(focal_ratio="scene"))
-    with pytest.raises(InputError, match="or say 'scene'"):
-        module(scene, tmp_path, focal_ratio="guess")
+def test_a_camera_of_pictures_of_another_shape_is_refused(scene, tmp_path):
+    phone = {"width": 640, "height": 480, "focal_px": [560.0, 560.0], "centre_px": [319.5, 239.5]}  # as 32x24
+    edit(scene, cameras={"phone": phone})
+    module(scene, tmp_path).setup("fit")
+    edit(scene, cameras={"phone": {**phone, "height": 360}})
+    with pytest.raises(InputError, match=r"\.png: has another shape than its camera's 640x360 pixels\. Give the"):
+        module(scene, tmp_path).setup("fit")

@@ -1,7 +1,8 @@
-"""Points and intrinsics in batches: they follow a coloured spot through resize, crop, skipped frames and splits."""
+"""Points and cameras in batches: they follow a coloured spot through resize, crop, skipped frames and splits."""
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import cv2
@@ -16,6 +17,8 @@ from mambaloc.types import PoseBatch
 
 SIZE, SHORT_SIDE, CROP = (64, 48), 36, (30, 36)
 K = np.array([[50.0, 0, 30], [0, 52, 25], [0, 0, 1]])
+"""The colour camera's. The depth camera has twice its focal length, and sees the same ray at another pixel."""
+DEPTH_K = np.array([[100.0, 0, 33], [0, 104, 22], [0, 0, 1]])
 RED, REACH = (0, 0, 255), 3
 
 
@@ -28,12 +31,13 @@ def spot(number: int) -> tuple[int, int]:
 def scene(write_tiny_scene):
     """Three training and one test sequence; each frame is black but for a red square, whose middle alone has depth."""
     scene = write_tiny_scene({1: 6, 2: 6, 3: 4, 4: 4}, test=(4,))
-    np.savetxt(scene.folder / "camera-intrinsics.txt", K)
+    np.savetxt(scene.folder / "camera-intrinsics.txt", DEPTH_K)
+    (scene.folder / "scene.json").write_text(json.dumps({"intrinsics_px": K.tolist()}))
     for number, image in enumerate(scene.images):
         x, y = spot(number)
         picture, depth_mm = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16)
         picture[y - REACH : y + REACH + 1, x - REACH : x + REACH + 1] = RED
-        depth_mm[y, x] = 1000 + 10 * number
+        depth_mm[2 * (y - 25) + 22, 2 * (x - 30) + 33] = 1000 + 10 * number
         cv2.imwrite(str(image), picture)
         cv2.imwrite(str(image).replace(".color.", ".depth."), depth_mm)
     return scene
@@ -125,12 +129,12 @@ def test_each_frame_has_its_own_points_also_where_others_are_skipped(make, scene
         assert batch.points_m[:, 1].isnan().all()  # each frame has depth at one pixel
 
 
-def test_test_frames_carry_none_unless_they_are_validated_on(make):
+def test_test_frames_carry_points_only_where_they_are_validated_on(make):
     module = make()
     module.setup("fit")
     module.setup("test")
     (batch,) = module.test_dataloader()
-    assert (batch.points_m, batch.intrinsics) == (None, None)
+    assert batch.points_m is None
     selecting = make(validation="test_set")
     selecting.setup("fit")
     (validated,) = selecting.val_dataloader()
@@ -141,9 +145,23 @@ def test_by_default_none_are_read(make):
     module = make(points_per_frame=0)
     module.setup("fit")
     (batch,) = module.val_dataloader()
-    out = module.on_after_batch_transfer(batch, 0)
-    assert (out.points_m, out.intrinsics) == (None, None)
+    assert module.on_after_batch_transfer(batch, 0).points_m is None
     assert "points_source" not in module.describe()
+
+
+def test_every_part_has_its_cameras_with_and_without_points(make):
+    by_hand = np.array([[37.5, 0, 30.5 * 0.75 - 0.5 - 6], [0, 39, 25.5 * 0.75 - 0.5 - 3], [0, 0, 1]])
+    for count in (0, 2):
+        module = make(points_per_frame=count)
+        module.setup("fit")
+        module.setup("test")
+        for part, loader in (("val", module.val_dataloader()), ("test", module.test_dataloader())):
+            (fetched,), (batch,) = loader, module.batches(part)
+            for found in (batch, module.on_after_batch_transfer(fetched, 0)):
+                np.testing.assert_allclose(found.intrinsics, [by_hand] * 4, rtol=1e-6)
+                assert found.intrinsics.dtype == torch.float32
+        (described,) = {json.dumps(of) for of in module.describe()["cameras"].values()}
+        assert json.loads(described) == {"focal_ratio": 0.7812, "assumed": False}
 
 
 def test_describe_says_how_many_points_and_whence(make):

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mambaloc.data.cameras import known_cameras
 from mambaloc.data.datasets.seven_scenes import read_split
-from mambaloc.data.frames import BadFrames, Frames
+from mambaloc.data.frames import BadFrames, Cameras, Frames
 from mambaloc.data.points import ScenePoints, read_points
 from mambaloc.errors import InputError
 from mambaloc.rendering import default_intrinsics, furnished_room, shots_of_sequences, write_7scenes
@@ -36,16 +37,23 @@ def frames(rendered) -> Frames:
 
 
 @pytest.fixture(scope="module")
-def points(rendered, frames) -> ScenePoints:
-    return read_points(rendered, frames, 40, seed=0)
+def cameras(rendered, frames) -> Cameras:
+    return known_cameras("7scenes", rendered, frames)
 
 
-def seen(points: ScenePoints, frames: Frames, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+@pytest.fixture(scope="module")
+def points(rendered, frames, cameras) -> ScenePoints:
+    return read_points(rendered, frames, cameras, 40, seed=0)
+
+
+def seen(
+    points: ScenePoints, frames: Frames, row: int, camera: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A frame's points (K, 3), the pixels that OpenCV projects them to (K, 2), and their depths in metres (K,)."""
     points_m = points.points_m[row][np.isfinite(points.points_m[row]).all(axis=1)].astype(float)
     cam_from_world = Rotation.from_quat(np.roll(frames.quaternion[row], -1)).inv()
     t = -cam_from_world.apply(frames.position_m[row])
-    camera = points.intrinsics[row].astype(float)
+    camera = default_intrinsics(SIZE) if camera is None else camera
     pixels = cv2.projectPoints(points_m, cam_from_world.as_rotvec(), t, camera, None)[0][:, 0]
     return points_m, pixels, cam_from_world.apply(points_m)[:, 2] + t[2]
 
@@ -56,10 +64,7 @@ def depth_file(image: Path) -> Path:
 
 def test_points_lie_on_what_the_frame_shows(points, frames):
     assert points.source == "depth"
-    assert points.size_px == SIZE
-    assert points.points_m.shape == (24, 40, 3)
-    assert (points.points_m.dtype, points.intrinsics.dtype) == (np.float32, np.float32)
-    np.testing.assert_allclose(points.intrinsics, np.tile(default_intrinsics(SIZE), (24, 1, 1)))
+    assert (points.points_m.shape, points.points_m.dtype) == ((24, 40, 3), np.float32)
     for row in (0, 5, 10, 12, 17, 22):
         _, pixels, z_m = seen(points, frames, row)
         x, y = np.round(pixels).astype(int).T
@@ -81,7 +86,8 @@ def test_a_frame_without_depth_borrows_what_it_sees_of_its_neighbours(points, fr
 
 def test_only_depth_of_the_frames_asked_for_is_used(rendered, frames, points):
     kept = np.array([0, 2, 10, 11, 13])  # without frame 5; and 13 alone of the second sequence, without depth
-    few = read_points(rendered, frames.select(kept), 40, seed=0)
+    of_kept = frames.select(kept)
+    few = read_points(rendered, of_kept, known_cameras("7scenes", rendered, of_kept), 40, seed=0)
     owned = {tuple(point) for row in (0, 10) for point in points.points_m[row]}
     assert {tuple(point) for point in few.points_m[1] if np.isfinite(point).all()} <= owned
     assert few.per_frame()[-1] == 0
@@ -89,8 +95,8 @@ def test_only_depth_of_the_frames_asked_for_is_used(rendered, frames, points):
         np.testing.assert_array_equal(few.points_m[2 * row], points.points_m[of])  # whichever others are read
 
 
-def test_points_depend_on_the_seed_alone(rendered, frames, points):
-    again, other = (read_points(rendered, frames, 40, seed=seed) for seed in (0, 1))
+def test_points_depend_on_the_seed_alone(rendered, frames, cameras, points):
+    again, other = (read_points(rendered, frames, cameras, 40, seed=seed) for seed in (0, 1))
     np.testing.assert_array_equal(again.points_m, points.points_m)
     assert not np.array_equal(other.points_m[0], points.points_m[0])
     assert (np.diff(points.points_m[[0, 5]], axis=0) != 0).any()
@@ -105,6 +111,15 @@ def tiny(write_tiny_scene):
     return write_tiny_scene({1: 3})
 
 
+DEPTH_CAMERA = np.array([[585 / 20, 0, 320.5 / 20 - 0.5], [0, 585 / 20, 240.5 / 20 - 0.5], [0, 0, 1]])
+"""The official depth sensor's, in pixels of frames of 32x24."""
+
+
+def read_tiny(folder: Path, count: int) -> ScenePoints:
+    frames = read_split(folder, "train", BadFrames())
+    return read_points(folder, frames, known_cameras("7scenes", folder, frames), count, seed=3)
+
+
 def test_invalid_depth_is_never_used(tiny):
     depth_mm = np.zeros((24, 32), np.uint16)
     depth_mm[::2] = 65535
@@ -112,33 +127,53 @@ def test_invalid_depth_is_never_used(tiny):
     write_depth(tiny.images[0], depth_mm)
     write_depth(tiny.images[1], np.zeros((24, 32), np.uint16))
     frames = read_split(tiny.folder, "train", BadFrames())
-    points = read_points(tiny.folder, frames, 10, seed=3)
-    _, pixels, z_m = seen(points, frames, 0)
+    points = read_tiny(tiny.folder, 10)
+    _, pixels, z_m = seen(points, frames, 0, DEPTH_CAMERA)
     found = {(*np.round(pixel).astype(int).tolist(), round(1000 * z)) for pixel, z in zip(pixels, z_m, strict=True)}
     assert found == {(3, 7, 1200), (31, 10, 65534), (0, 0, 1)}
     assert points.per_frame()[1] == 0
 
 
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (32, 24)])
-def test_without_a_file_the_camera_is_the_official_one_at_any_size(tiny, size):
-    write_depth(tiny.images[0], np.full(size[::-1], 900, np.uint16))
-    points = read_points(tiny.folder, read_split(tiny.folder, "train", BadFrames()), 5, seed=0)
+def test_without_a_file_the_depth_camera_is_the_official_one_at_any_size(tiny, size):
+    depth_mm = np.zeros(size[::-1], np.uint16)
+    depth_mm[2, 3] = 900
+    write_depth(tiny.images[0], depth_mm)
     scale = size[0] / 640
-    by_hand = [[585 * scale, 0, 320.5 * scale - 0.5], [0, 585 * scale, 240.5 * scale - 0.5], [0, 0, 1]]
-    np.testing.assert_allclose(points.intrinsics[0], by_hand, rtol=1e-6)
-    assert points.size_px == size
+    by_hand = np.array([[585 * scale, 0, 320.5 * scale - 0.5], [0, 585 * scale, 240.5 * scale - 0.5], [0, 0, 1]])
+    _, pixels, z_m = seen(read_tiny(tiny.folder, 5), read_split(tiny.folder, "train", BadFrames()), 0, by_hand)
+    np.testing.assert_allclose([[*pixels[0], z_m[0]]], [[3, 2, 0.9]], atol=1e-4)
 
 
-def test_the_scenes_own_camera_comes_first(tiny):
-    write_depth(tiny.images[0], np.full((24, 32), 900, np.uint16))
+def test_the_scenes_own_depth_camera_comes_first(tiny):
+    depth_mm = np.zeros((24, 32), np.uint16)
+    depth_mm[2, 3] = 900
+    write_depth(tiny.images[0], depth_mm)
     (tiny.folder / "camera-intrinsics.txt").write_text("30 0 15\n0 31 11\n\n0 0 1\n")
-    points = read_points(tiny.folder, read_split(tiny.folder, "train", BadFrames()), 5, seed=0)
-    np.testing.assert_array_equal(points.intrinsics[2], [[30, 0, 15], [0, 31, 11], [0, 0, 1]])
+    camera = np.array([[30.0, 0, 15], [0, 31, 11], [0, 0, 1]])
+    _, pixels, z_m = seen(read_tiny(tiny.folder, 5), read_split(tiny.folder, "train", BadFrames()), 0, camera)
+    np.testing.assert_allclose([[*pixels[0], z_m[0]]], [[3, 2, 0.9]], atol=1e-4)
+
+
+def test_a_frame_borrows_what_its_colour_camera_sees(tiny):
+    """Frames of one pose, depth of one: a camera with a narrower view sees fewer of its points."""
+    write_depth(tiny.images[0], np.full((24, 32), 900, np.uint16))
+    for image in tiny.images[1:]:
+        np.savetxt(image.with_name(image.name.replace("color.png", "pose.txt")), tiny.world_from_cam[0])
+    frames = read_split(tiny.folder, "train", BadFrames())
+    wide = known_cameras("7scenes", tiny.folder, frames)
+    narrow = Cameras(wide.intrinsics.copy(), wide.size_px)
+    narrow.intrinsics[1, 0, 0] *= 2
+    points = read_points(tiny.folder, frames, narrow, 32 * 24, seed=0)
+    assert points.per_frame()[2] == points.per_frame()[0] == 32 * 24
+    _, pixels, _ = seen(points, frames, 1, narrow.intrinsics[1])
+    of_all = seen(points, frames, 0, narrow.intrinsics[1])[1]
+    assert len(pixels) == (np.abs(of_all[:, 0] - 15.5) < 16).sum() < 32 * 24
 
 
 def one_line(folder: Path) -> str:
     with pytest.raises(InputError) as caught:
-        read_points(folder, read_split(folder, "train", BadFrames()), 5, seed=0)
+        read_tiny(folder, 5)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -196,8 +231,7 @@ def test_real_depth_gives_every_frame_points(shared_data):
     if not folder.is_dir():
         pytest.skip(f"no real scene at {folder}")
     frames = read_split(folder, "test", BadFrames())
-    points = read_points(folder, frames, 100, seed=0)
+    cameras = known_cameras("7scenes", folder, frames)
+    points = read_points(folder, frames, cameras, 100, seed=0)
     assert points.per_frame().min() > 50  # frames between two with depth see most of what those see
     assert np.nanmax(np.abs(points.points_m)) < 10
-    assert points.size_px == (640, 480)
-    np.testing.assert_array_equal(points.intrinsics[7], [[585, 0, 320], [0, 585, 240], [0, 0, 1]])

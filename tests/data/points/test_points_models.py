@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mambaloc.data.cameras import known_cameras, known_or_assumed_cameras
 from mambaloc.data.datasets.cambridge import read_split
 from mambaloc.data.frames import BadFrames, Frames
 from mambaloc.data.points import ScenePoints, colmap, read_points
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, InputWarning
 from mambaloc.rendering import default_intrinsics, furnished_room, render, shots_of_sequences, write_cambridge
 from mambaloc.rendering.trajectories import smooth_trajectory
 
@@ -51,9 +52,8 @@ def pixels_and_depths(points_m: np.ndarray, frames: Frames, row: int) -> tuple[n
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_tracked_points_are_what_the_frame_shows(rendered, room, split):
     frames = read_split(rendered, split, BadFrames())
-    points = read_points(rendered, frames, 200, seed=0)
-    assert (points.source, points.size_px, points.points_m.shape) == ("nvm", SIZE, (6, 200, 3))
-    np.testing.assert_allclose(points.intrinsics, np.tile(default_intrinsics(SIZE), (6, 1, 1)), rtol=1e-6)
+    points = read_points(rendered, frames, known_cameras("cambridge", rendered, frames), 200, seed=0)
+    assert (points.source, points.points_m.shape) == ("nvm", (6, 200, 3))
     assert points.per_frame().min() > 100
     for row in range(6):
         pixels, z_m = pixels_and_depths(finite(points.points_m[row]).astype(float), frames, row)
@@ -129,7 +129,8 @@ def yard(tmp_path) -> Path:
 def read(yard: Path, text: str | None = None, count: int = 5) -> ScenePoints:
     if text is not None:
         (yard / "reconstruction.nvm").write_text(text)
-    return read_points(yard, read_split(yard, "train", BadFrames()), count, seed=0)
+    frames = read_split(yard, "train", BadFrames())
+    return read_points(yard, frames, known_or_assumed_cameras("cambridge", yard, frames), count, seed=0)
 
 
 @pytest.mark.parametrize("tail", ["", "0\n", "2\nx y\n", "0\n#the last part of NVM file points to the PLY files\n0\n"])
@@ -138,9 +139,31 @@ def test_each_frame_has_the_points_whose_track_lists_its_image(yard, tail):
     assert points.per_frame().tolist() == [2, 2, 0, 0]
     np.testing.assert_array_equal(finite(points.points_m[0]), [[1, 2, 9], [3, 2, 9]])  # and none 7000 km away
     np.testing.assert_array_equal(finite(points.points_m[1]), [[1, 2, 9], [5, 5, 5]])
-    assert points.intrinsics[:, 0, 0].tolist() == [100, 110, 105, 105]  # unknown: the median of the known
-    np.testing.assert_array_equal(points.intrinsics[1], [[110, 0, 19.5], [0, 110, 14.5], [0, 0, 1]])
-    assert points.size_px == (40, 30)
+
+
+def test_each_frame_has_the_focal_length_of_its_image(yard):
+    (yard / "reconstruction.nvm").write_text(nvm([*CAMERAS, "seq1/c.jpg 90 1 0 0 0 7 7 7 0 0"], POINTS))
+    cameras = known_cameras("cambridge", yard, read_split(yard, "train", BadFrames()))
+    assert cameras.intrinsics[:, 0, 0].tolist() == [100, 110, 90, 100]  # d is unknown: the median of the known
+    np.testing.assert_array_equal(cameras.intrinsics[1], [[110, 0, 19.5], [0, 110, 14.5], [0, 0, 1]])
+    assert (cameras.size_px == (40, 30)).all()
+    assert not cameras.is_assumed
+
+
+@pytest.mark.parametrize("damage", ["NVM_V3\n3\n" + CAMERAS[0], nvm([CAMERAS[0].replace("100", "-1")], [])])
+def test_a_damaged_model_stops_the_run_that_would_have_its_cameras(yard, damage):
+    (yard / "reconstruction.nvm").write_text(damage)
+    with pytest.raises(InputError, match=r"reconstruction\.nvm.* get it again"):
+        known_or_assumed_cameras("cambridge", yard, read_split(yard, "train", BadFrames()))
+
+
+def test_cameras_of_other_images_are_not_those_of_the_frames(yard):
+    (yard / "reconstruction.nvm").write_text(nvm(["seq9/z.jpg 100 1 0 0 0 1 2 3 0 0"], []))
+    frames = read_split(yard, "train", BadFrames())
+    with pytest.warns(InputWarning, match=r"nvm: has no camera of 4 frames, such as .*a\.png\. .* 0\.87 of .* assumed"):
+        cameras = known_or_assumed_cameras("cambridge", yard, frames)
+    np.testing.assert_allclose(cameras.intrinsics, [[[34.8, 0, 19.5], [0, 34.8, 14.5], [0, 0, 1]]] * 4)
+    assert cameras.is_assumed
 
 
 def test_too_many_points_are_drawn_from(yard):
@@ -247,12 +270,15 @@ def write_model(folder: Path, binary: bool, camera_model: str = "SIMPLE_RADIAL",
 def test_a_colmap_model_is_read_as_it_was_written(yard, place, binary, camera_model):
     write_model(yard / place, binary, camera_model)
     points = read(yard)
-    assert (points.source, points.size_px) == ("colmap", (80, 60))
+    assert points.source == "colmap"
     assert points.per_frame().tolist() == [1, 2, 0, 0]
     np.testing.assert_array_equal(finite(points.points_m[0]), [[1, 2, 9]])
     np.testing.assert_array_equal(sorted(finite(points.points_m[1]).tolist()), [[1, 2, 9], [5, 5, 5]])
-    focal_y = 102 if camera_model == "PINHOLE" else 100  # pixels from their centres: half a pixel less than COLMAP's
-    np.testing.assert_allclose(points.intrinsics[0], [[100, 0, 40.5], [0, focal_y, 28.5], [0, 0, 1]])
+    cameras = known_cameras("cambridge", yard, read_split(yard, "train", BadFrames()))
+    focal_y = 51 if camera_model == "PINHOLE" else 50  # the model is of pictures of twice the size, 80x60
+    by_hand = [[50, 0, 41 / 2 - 0.5], [0, focal_y, 29 / 2 - 0.5], [0, 0, 1]]  # COLMAP counts from the corner
+    np.testing.assert_allclose(cameras.intrinsics, [by_hand] * 4)
+    assert (cameras.size_px == (40, 30)).all()
 
 
 def test_a_colmap_model_in_another_frame_is_refused(yard):
