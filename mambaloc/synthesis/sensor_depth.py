@@ -30,5 +30,5 @@ def carried_depth(
         size[::-1],
         flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_CONSTANT,
-        borderValue=float("nan"),  # type: ignore[arg-type]
+        borderValue=float("nan"),
     )

@@ -1,7 +1,7 @@
 """Views of a scene at poses where nobody took a picture, from frames with depth.
 
-The depth of the nearest frames is splatted into the new camera with a z-buffer. Each pixel takes its depth from the
-best-ranked frame within 3 % of the nearest surface, and its colour from where that frame sees it, between pixels.
+The depth of the nearest frames is splatted into the new camera with a z-buffer, whose cracks are closed. Each pixel is
+then looked up in the frames: the best-ranked one whose depth agrees within 3 % gives its colour, between pixels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 FRAMES = 12
 """How many frames a view is made from."""
 
-_SAME_SURFACE = 1.03  # of the nearest depth
+_SAME_SURFACE = 0.03  # of the depth
 _EDGE = 0.05  # of the depth, over three pixels
 _NEAR = 0.02  # of the median depth
 
@@ -48,68 +48,28 @@ class Splatter:
     def __init__(self, source: PosedDepth, device: torch.device | str = "cpu") -> None:
         self.source, self.device = source, torch.device(device)
         self.scale_m = source.median_depth_m
-        depth_m = torch.from_numpy(source.depth_m).to(self.device)
-        self._depth_m = without_edges(depth_m).flatten(1)
+        self._depth_m = without_edges(torch.from_numpy(source.depth_m).to(self.device)).flatten(1)
         self._colors = torch.from_numpy(source.images).to(self.device).flatten(2).transpose(1, 2).reshape(-1, 3)
-        self._rays = _pixels(*source.depth_m.shape[1:], self.device)
         self._pixel_from_world = source.intrinsics @ np.linalg.inv(source.world_from_cam)[:, :3]
-        self._forward = source.world_from_cam[:, :3, 2]
 
-    def nearest(self, world_from_cam: Floats, allowed: Floats | None = None) -> Floats:
+    def nearest(self, world_from_cam: Floats, allowed: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
         """The frames that see most alike, best first: near in position, in median depths, and in direction, in radians.
 
         Args:
             world_from_cam: (V, 4, 4).
-            allowed: which frames may be taken, (V, S) or (S,) bool; all unless given.
+            allowed: which frames may be taken, (V, S); all unless given.
 
         Returns:
-            rows (V, N), of at most :data:`FRAMES`.
+            rows (V, N), of at most :data:`FRAMES`; -1 where no more may be taken.
         """
-        offset = np.linalg.norm(world_from_cam[:, None, :3, 3] - self.source.world_from_cam[:, :3, 3], axis=-1)
-        angle = np.arccos(np.clip(world_from_cam[:, :3, 2] @ self._forward.T, -1, 1))
+        frames = self.source.world_from_cam
+        offset = np.linalg.norm(world_from_cam[:, None, :3, 3] - frames[:, :3, 3], axis=-1)
+        angle = np.arccos(np.clip(world_from_cam[:, :3, 2] @ frames[:, :3, 2].T, -1, 1))
         apart = np.hypot(offset / self.scale_m, angle)
         if allowed is not None:
-            apart = np.where(allowed, apart, np.inf)
-        return np.argsort(apart, axis=1, kind="stable")[:, :FRAMES]
-
-    def render(
-        self, world_from_cam: Floats, intrinsics: Floats, size: tuple[int, int], allowed: Floats | None = None
-    ) -> Rendered:
-        """Render views.
-
-        Args:
-            world_from_cam: (V, 4, 4).
-            intrinsics: of the views, (V, 3, 3), in pixels of ``size``.
-            size: (height, width) of the views.
-            allowed: which frames may be taken, (V, S) or (S,) bool; all unless given.
-        """
-        rows = self.nearest(world_from_cam, allowed)
-        views, frames = rows.shape
-        height, width = size
-        view_from_frame, shift = self._between(rows, world_from_cam, intrinsics)
-        usable = torch.from_numpy(rows).to(self.device)
-
-        # depth * (M @ pixel) + shift: what pixels of the frames are in the view, times their depth there
-        depth_m = self._depth_m[usable]
-        if allowed is not None:
-            is_allowed = np.take_along_axis(np.broadcast_to(allowed, (views, len(self.source))), rows, axis=1)
-            depth_m = depth_m.masked_fill(~torch.from_numpy(is_allowed).to(self.device)[..., None], torch.nan)
-        seen = (self._tensor(view_from_frame).reshape(-1, 3) @ self._rays).reshape(views, frames, 3, -1)
-        seen.mul_(depth_m[:, :, None]).add_(self._tensor(shift)[..., None])
-        z = seen[:, :, 2].contiguous()
-        x, y = (seen[:, :, axis].div(z).round_() for axis in (0, 1))
-        is_inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (z > _NEAR * self.scale_m)  # NaN is outside
-        target = torch.where(is_inside, y.mul_(width).add_(x), height * width).long().flatten(1)
-
-        winner, z_won = _nearest_surface(target, z.flatten(1), height * width)
-        is_hole = winner < 0
-        rank = winner.clamp(min=0) // self._rays.shape[1]
-        colors = self._look_up(usable, rank, z_won, view_from_frame, shift, size)
-        images = torch.where(is_hole[:, None], 0, colors).reshape(views, 3, height, width)
-        known = (~is_hole).to(images).reshape(views, 1, height, width)
-        filled = _filled(images, known).clamp(0, 255).round().byte()
-        depth = torch.where(is_hole, torch.nan, z_won)
-        return Rendered(filled, depth.reshape(views, height, width), is_hole.float().mean(dim=1))
+            apart[~allowed] = np.inf
+        rows = np.argsort(apart, axis=1, kind="stable")[:, :FRAMES]
+        return np.where(np.isfinite(np.take_along_axis(apart, rows, axis=1)), rows, -1)
 
     def is_free(self, position_m: Floats) -> NDArray[np.bool_]:
         """Whether cameras may stand at points (V, 3): some frame sees past them, or none sees a surface before them."""
@@ -118,46 +78,102 @@ class Splatter:
         z = seen[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = np.rint(seen[..., 0] / z), np.rint(seen[..., 1] / z)
-            is_seen = (z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        is_seen = (z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         x, y = (np.where(is_seen, axis, 0).astype(int) for axis in (x, y))
         surface_m = np.where(is_seen, self.source.depth_m[np.arange(len(self.source)), y, x], np.nan)
-        is_past = (surface_m > _SAME_SURFACE * z).any(axis=1)
-        return is_past | ~(z > _SAME_SURFACE * surface_m).any(axis=1)
+        is_past = (surface_m > (1 + _SAME_SURFACE) * z).any(axis=1)
+        return is_past | ~(z > (1 + _SAME_SURFACE) * surface_m).any(axis=1)
 
-    def _between(self, rows: Floats, world_from_cam: Floats, intrinsics: Floats) -> tuple[Floats, Floats]:
-        """Matrices (V, N, 3, 3) and shifts (V, N, 3) from pixels of frames to pixels of views."""
+    def render(
+        self,
+        world_from_cam: Floats,
+        intrinsics: Floats,
+        size: tuple[int, int],
+        allowed: NDArray[np.bool_] | None = None,
+    ) -> Rendered:
+        """Render views.
+
+        Args:
+            world_from_cam: (V, 4, 4).
+            intrinsics: of the views, (V, 3, 3), in pixels of ``size``.
+            size: (height, width) of the views.
+            allowed: which frames each may be made from, (V, S); all unless given.
+        """
+        rows = self.nearest(world_from_cam, allowed)
+        frame = torch.from_numpy(rows).to(self.device)
+        matrix, shift = self._between(rows, world_from_cam, intrinsics)
+        nearest = closed(self._z_buffer(frame, self._tensor(matrix), self._tensor(shift), size))
+        back = np.linalg.inv(matrix)
+        back_shift = -np.einsum("vnij,vnj->vni", back, shift)
+        colors, depth_m = self._look_up(frame, self._tensor(back), self._tensor(back_shift), nearest)
+        is_known = ~depth_m.isnan()
+        images = filled(torch.where(is_known[:, None], colors, 0), is_known[:, None].to(colors))
+        return Rendered(images.clamp(0, 255).round().byte(), depth_m, 1 - is_known.float().mean(dim=(1, 2)))
+
+    def _between(self, rows: NDArray[np.int64], world_from_cam: Floats, intrinsics: Floats) -> tuple[Floats, Floats]:
+        """``matrix`` (V, N, 3, 3) and ``shift`` (V, N, 3): a frame's pixel times its depth, in it and in a view."""
         view_from_world = intrinsics @ np.linalg.inv(world_from_cam)[:, :3]
-        frame_from_cam = np.linalg.inv(self.source.intrinsics)[rows]
-        world_from_frame = self.source.world_from_cam[rows]
-        view_from_cam = view_from_world[:, None, :, :3] @ world_from_frame[..., :3, :]
+        view_from_cam = view_from_world[:, None, :, :3] @ self.source.world_from_cam[rows][..., :3, :]
         shift = view_from_cam[..., 3] + view_from_world[:, None, :, 3]
-        return view_from_cam[..., :3] @ frame_from_cam, shift
+        return view_from_cam[..., :3] @ np.linalg.inv(self.source.intrinsics)[rows], shift
 
-    def _look_up(
-        self, rows: Tensor, rank: Tensor, z: Tensor, view_from_frame: Floats, shift: Floats, size: tuple[int, int]
-    ) -> Tensor:
-        """Colours (V, 3, P) of the surface in each pixel, between the pixels of the frame that won it."""
-        views, frames = rows.shape
-        frame_from_view = np.linalg.inv(view_from_frame)
-        back = self._tensor(np.einsum("vnij,vnj->vni", frame_from_view, shift))
-        at = (self._tensor(frame_from_view).reshape(-1, 3) @ _pixels(*size, self.device)).reshape(views, frames, 3, -1)
-        of_rank = rank[:, None].expand(-1, 3, -1)
-        at = at.gather(1, of_rank[:, None])[:, 0] * z[:, None] - back.transpose(1, 2).gather(2, of_rank)
+    def _z_buffer(self, frame: Tensor, matrix: Tensor, shift: Tensor, size: tuple[int, int]) -> Tensor:
+        """Depth (V, H, W) of the nearest point that falls on each pixel; infinite where none does."""
+        views, (height, width) = len(frame), size
+        depth_m = self._depth_m[frame].masked_fill_((frame < 0)[..., None], torch.nan)
+        seen = _carried(matrix, shift, self.source.depth_m.shape[1:], depth_m[:, :, None])
+        z = seen[:, :, 2].contiguous()
+        x, y = (seen[:, :, axis].div(z).round_() for axis in (0, 1))
+        is_inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (z > _NEAR * self.scale_m)  # NaN is outside
+        pixel = torch.where(is_inside, y.mul_(width).add_(x), height * width).long()
+        pixel += torch.arange(views, device=self.device)[:, None, None] * (height * width + 1)
+        nearest = z.new_full((views * (height * width + 1),), torch.inf)
+        nearest.scatter_reduce_(0, pixel.flatten(), z.flatten(), "amin")
+        return nearest.reshape(views, -1)[:, :-1].reshape(views, height, width)
+
+    def _look_up(self, frame: Tensor, matrix: Tensor, shift: Tensor, nearest: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours (V, 3, H, W) and depth (V, H, W) in the first frame that sees each surface; NaN where none does."""
+        views = len(frame)
         height, width = self.source.depth_m.shape[1:]
-        x = (at[:, 0] / at[:, 2]).nan_to_num(0).clamp(0, width - 1)
-        y = (at[:, 1] / at[:, 2]).nan_to_num(0).clamp(0, height - 1)
+        size = nearest.shape[1:]
+        seen = _carried(matrix, shift, size, nearest.reshape(views, 1, 1, -1))
+        z = seen[:, :, 2].contiguous()
+        x, y = (seen[:, :, axis].div(z) for axis in (0, 1))
+        is_inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1) & (z > 0)
+        pixel = torch.where(is_inside, y.round().mul_(width).add_(x.round()), 0).long()
+        pixel += frame.clamp(min=0)[..., None] * (height * width)
+        ratio = self._depth_m.flatten()[pixel].div_(z)
+        agrees = is_inside & ((ratio - 1).abs_() < _SAME_SURFACE) & (frame >= 0)[..., None]
+        is_known, rank = agrees.byte().max(dim=1)  # the first of equals
+        x, y, ratio = (values.gather(1, rank[:, None])[:, 0] for values in (x, y, ratio))
+        is_known = is_known.bool()
+        colors = self._between_pixels(frame.gather(1, rank), x.where(is_known, 0), y.where(is_known, 0))
+        depth_m = torch.where(is_known, nearest.flatten(1) * ratio, torch.nan)
+        return colors.reshape(views, 3, *size), depth_m.reshape(views, *size)
+
+    def _between_pixels(self, frame: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Colours of frames at points; all (V, P) -> (V, 3, P)."""
+        height, width = self.source.depth_m.shape[1:]
         left, top = x.long().clamp(max=width - 2), y.long().clamp(max=height - 2)
-        x, y = (x - left)[..., None], (y - top)[..., None]
-        corner = (rows.gather(1, rank) * height + top) * width + left
+        right, below = (x - left)[..., None], (y - top)[..., None]
+        corner = (frame.clamp(min=0) * height + top) * width + left
 
-        def row_of(corner: Tensor) -> Tensor:
-            first, second = (self._colors[corner + step].float() for step in (0, 1))
-            return torch.lerp(first, second, x)
+        def between(pixel: Tensor) -> Tensor:
+            first, second = (self._colors[pixel + step].float() for step in (0, 1))
+            return torch.lerp(first, second, right)
 
-        return torch.lerp(row_of(corner), row_of(corner + width), y).transpose(1, 2)
+        return torch.lerp(between(corner), between(corner + width), below).transpose(1, 2)
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.from_numpy(values).to(self.device, torch.float32)
+
+
+def _carried(matrix: Tensor, shift: Tensor, size: tuple[int, ...], depth_m: Tensor) -> Tensor:
+    """Pixels times their depth, in another camera: (V, N, 3, 3), (V, N, 3), (V, N or 1, 1, P) -> (V, N, 3, P)."""
+    y, x = torch.meshgrid(*(torch.arange(length) for length in size), indexing="ij")
+    pixels = torch.stack((x, y, torch.ones_like(x))).flatten(1).to(matrix)
+    rays = (matrix.reshape(-1, 3) @ pixels).reshape(*matrix.shape[:3], -1)
+    return rays.mul_(depth_m).add_(shift[..., None])
 
 
 def without_edges(depth_m: Tensor) -> Tensor:
@@ -167,33 +183,14 @@ def without_edges(depth_m: Tensor) -> Tensor:
     return depth_m.masked_fill(farthest - nearest > _EDGE * depth_m, torch.nan)
 
 
-def _pixels(height: int, width: int, device: torch.device) -> Tensor:
-    """Homogeneous pixels, (3, height * width)."""
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    return torch.stack((x, y, torch.ones_like(x))).flatten(1).to(device, torch.float32)
+def closed(depth_m: Tensor) -> Tensor:
+    """Close cracks of up to two pixels, through which a surface behind shows: (V, H, W), infinite where unknown."""
+    inverse = 1 / depth_m[:, None]
+    dilated = F.max_pool2d(inverse, 3, 1, 1)
+    return 1 / -F.max_pool2d(-dilated, 3, 1, 1)[:, 0]
 
 
-def _nearest_surface(target: Tensor, z: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
-    """The first point within 3 % of the nearest in each pixel, and its depth.
-
-    Shape:
-        ``target`` (V, M): the pixel that each point falls on, ``pixels`` where on none; ``z`` (V, M) ->
-        (V, pixels) row of the point, -1 where there is none; (V, pixels).
-    """
-    views, points = z.shape
-    target = target + (pixels + 1) * torch.arange(views, device=z.device)[:, None]
-    nearest = z.new_full((views * (pixels + 1),), torch.inf)
-    nearest.scatter_reduce_(0, target.flatten(), z.flatten(), "amin")
-    row = torch.arange(points, dtype=torch.int32, device=z.device).expand(views, -1)
-    row = torch.where(z <= _SAME_SURFACE * nearest[target], row, points)
-    winner = torch.full_like(nearest, points, dtype=torch.int32)
-    winner.scatter_reduce_(0, target.flatten(), row.flatten(), "amin")
-    winner = winner.reshape(views, -1)[:, :pixels].long()
-    z_won = z.gather(1, winner.clamp(max=points - 1))
-    return torch.where(winner == points, -1, winner), z_won
-
-
-def _filled(images: Tensor, known: Tensor) -> Tensor:
+def filled(images: Tensor, known: Tensor) -> Tensor:
     """Fill holes from what surrounds them, from fine to coarse (pull-push, Gortler et al. 1996).
 
     Shape:
@@ -203,6 +200,6 @@ def _filled(images: Tensor, known: Tensor) -> Tensor:
         return images
     weight = F.avg_pool2d(known, 2, ceil_mode=True)
     coarse = F.avg_pool2d(images, 2, ceil_mode=True) / weight.clamp(min=1e-6)
-    coarse = _filled(coarse, (weight > 0).to(images))
+    coarse = filled(coarse, (weight > 0).to(images))
     rough = F.interpolate(coarse, images.shape[-2:], mode="bilinear", align_corners=False)
     return torch.where(known > 0, images, rough)
