@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,10 +32,16 @@ class PosedDepth:
     def __len__(self) -> int:
         return len(self.images)
 
-    @property
+    @cached_property
     def median_depth_m(self) -> float:
         """The scene's scale: a camera that moves by a tenth of it sees a tenth of a radian of parallax."""
         return float(np.nanmedian(self.depth_m))
+
+    def apart(self, world_from_cam: Floats) -> Floats:
+        """How differently cameras see: offset in median depths and turn of the view in radians, (V, 4, 4) -> (V, S)."""
+        offset = np.linalg.norm(world_from_cam[:, None, :3, 3] - self.world_from_cam[:, :3, 3], axis=-1)
+        turn_rad = np.arccos(np.clip(world_from_cam[:, :3, 2] @ self.world_from_cam[:, :3, 2].T, -1, 1))
+        return np.hypot(offset / self.median_depth_m, turn_rad)
 
     def select(self, rows: Rows) -> PosedDepth:
         """Some of them."""

@@ -53,7 +53,7 @@ class Splatter:
         self._pixel_from_world = source.intrinsics @ np.linalg.inv(source.world_from_cam)[:, :3]
 
     def nearest(self, world_from_cam: Floats, allowed: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
-        """The frames that see most alike, best first: near in position, in median depths, and in direction, in radians.
+        """The frames that see most alike, the best first.
 
         Args:
             world_from_cam: (V, 4, 4).
@@ -62,10 +62,7 @@ class Splatter:
         Returns:
             rows (V, N), of at most :data:`FRAMES`; -1 where no more may be taken.
         """
-        frames = self.source.world_from_cam
-        offset = np.linalg.norm(world_from_cam[:, None, :3, 3] - frames[:, :3, 3], axis=-1)
-        angle = np.arccos(np.clip(world_from_cam[:, :3, 2] @ frames[:, :3, 2].T, -1, 1))
-        apart = np.hypot(offset / self.scale_m, angle)
+        apart = self.source.apart(world_from_cam)
         if allowed is not None:
             apart[~allowed] = np.inf
         rows = np.argsort(apart, axis=1, kind="stable")[:, :FRAMES]
@@ -101,7 +98,7 @@ class Splatter:
         """
         rows = self.nearest(world_from_cam, allowed)
         frame = torch.from_numpy(rows).to(self.device)
-        matrix, shift = self._between(rows, world_from_cam, intrinsics)
+        matrix, shift = between(self.source, rows, world_from_cam, intrinsics)
         nearest = closed(self._z_buffer(frame, self._tensor(matrix), self._tensor(shift), size))
         back = np.linalg.inv(matrix)
         back_shift = -np.einsum("vnij,vnj->vni", back, shift)
@@ -110,18 +107,11 @@ class Splatter:
         images = filled(torch.where(is_known[:, None], colors, 0), is_known[:, None].to(colors))
         return Rendered(images.clamp(0, 255).round().byte(), depth_m, 1 - is_known.float().mean(dim=(1, 2)))
 
-    def _between(self, rows: NDArray[np.int64], world_from_cam: Floats, intrinsics: Floats) -> tuple[Floats, Floats]:
-        """``matrix`` (V, N, 3, 3) and ``shift`` (V, N, 3): a frame's pixel times its depth, in it and in a view."""
-        view_from_world = intrinsics @ np.linalg.inv(world_from_cam)[:, :3]
-        view_from_cam = view_from_world[:, None, :, :3] @ self.source.world_from_cam[rows][..., :3, :]
-        shift = view_from_cam[..., 3] + view_from_world[:, None, :, 3]
-        return view_from_cam[..., :3] @ np.linalg.inv(self.source.intrinsics)[rows], shift
-
     def _z_buffer(self, frame: Tensor, matrix: Tensor, shift: Tensor, size: tuple[int, int]) -> Tensor:
         """Depth (V, H, W) of the nearest point that falls on each pixel; infinite where none does."""
         views, (height, width) = len(frame), size
         depth_m = self._depth_m[frame].masked_fill_((frame < 0)[..., None], torch.nan)
-        seen = _carried(matrix, shift, self.source.depth_m.shape[1:], depth_m[:, :, None])
+        seen = carried(matrix, shift, self.source.depth_m.shape[1:], depth_m[:, :, None])
         z = seen[:, :, 2].contiguous()
         x, y = (seen[:, :, axis].div(z).round_() for axis in (0, 1))
         is_inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (z > _NEAR * self.scale_m)  # NaN is outside
@@ -136,7 +126,7 @@ class Splatter:
         views = len(frame)
         height, width = self.source.depth_m.shape[1:]
         size = nearest.shape[1:]
-        seen = _carried(matrix, shift, size, nearest.reshape(views, 1, 1, -1))
+        seen = carried(matrix, shift, size, nearest.reshape(views, 1, 1, -1))
         z = seen[:, :, 2].contiguous()
         x, y = (seen[:, :, axis].div(z) for axis in (0, 1))
         is_inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1) & (z > 0)
@@ -147,11 +137,11 @@ class Splatter:
         is_known, rank = agrees.byte().max(dim=1)  # the first of equals
         x, y, ratio = (values.gather(1, rank[:, None])[:, 0] for values in (x, y, ratio))
         is_known = is_known.bool()
-        colors = self._between_pixels(frame.gather(1, rank), x.where(is_known, 0), y.where(is_known, 0))
+        colors = self._colors_at(frame.gather(1, rank), x.where(is_known, 0), y.where(is_known, 0))
         depth_m = torch.where(is_known, nearest.flatten(1) * ratio, torch.nan)
         return colors.reshape(views, 3, *size), depth_m.reshape(views, *size)
 
-    def _between_pixels(self, frame: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    def _colors_at(self, frame: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Colours of frames at points; all (V, P) -> (V, 3, P)."""
         height, width = self.source.depth_m.shape[1:]
         left, top = x.long().clamp(max=width - 2), y.long().clamp(max=height - 2)
@@ -168,7 +158,27 @@ class Splatter:
         return torch.from_numpy(values).to(self.device, torch.float32)
 
 
-def _carried(matrix: Tensor, shift: Tensor, size: tuple[int, ...], depth_m: Tensor) -> Tensor:
+def between(
+    source: PosedDepth, rows: NDArray[np.int64], world_from_cam: Floats, intrinsics: Floats
+) -> tuple[Floats, Floats]:
+    """What carries pixels times their depth from frames to views.
+
+    Args:
+        source: the frames.
+        rows: of those that each view takes, (V, N).
+        world_from_cam: of the views, (V, 4, 4).
+        intrinsics: of the views, (V, 3, 3).
+
+    Returns:
+        matrices (V, N, 3, 3) and shifts (V, N, 3).
+    """
+    view_from_world = intrinsics @ np.linalg.inv(world_from_cam)[:, :3]
+    view_from_cam = view_from_world[:, None, :, :3] @ source.world_from_cam[rows][..., :3, :]
+    shift = view_from_cam[..., 3] + view_from_world[:, None, :, 3]
+    return view_from_cam[..., :3] @ np.linalg.inv(source.intrinsics)[rows], shift
+
+
+def carried(matrix: Tensor, shift: Tensor, size: tuple[int, ...], depth_m: Tensor) -> Tensor:
     """Pixels times their depth, in another camera: (V, N, 3, 3), (V, N, 3), (V, N or 1, 1, P) -> (V, N, 3, P)."""
     y, x = torch.meshgrid(*(torch.arange(length) for length in size), indexing="ij")
     pixels = torch.stack((x, y, torch.ones_like(x))).flatten(1).to(matrix)
