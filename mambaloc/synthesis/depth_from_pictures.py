@@ -14,7 +14,7 @@ from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 _KEY_FRAMES = 160
 _POINTS_INSIDE = (0.01, 0.99)  # of the depths
 _MARGIN = 1.3
-_TRIAL_FRAMES, _TRIAL_OTHERS = 8, 2
+_TRIAL_FRAMES, _TRIAL_OTHERS = 6, 1
 _TRIAL_RANGE = (0.2, 40.0)  # of how far the cameras are spread
 _LEAST_KNOWN = 0.05
 
