@@ -1,6 +1,6 @@
 """Novel views: pictures at poses where nobody took one, rendered from posed frames with depth."""
 
-from mambaloc.synthesis.agreement import agreement, confirmed, without_disagreeing
+from mambaloc.synthesis.consistency import agreement, confirmed, without_disagreeing
 from mambaloc.synthesis.depth_from_pictures import depth_from_pictures
 from mambaloc.synthesis.gate import Quality, held_out_quality
 from mambaloc.synthesis.plane_sweep import PlaneSweep, SweepSettings

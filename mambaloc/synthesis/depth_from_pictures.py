@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.synthesis.agreement import confirmed
+from mambaloc.synthesis.consistency import confirmed
 from mambaloc.synthesis.plane_sweep import PlaneSweep, SweepSettings
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from mambaloc.runtime.rotations import (
     matrix_from_quaternion,
+    multiply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
     rotation_vector_between,
@@ -59,18 +60,17 @@ class PoseSampler:
         self.is_near = (apart < self.spread.between) & (turn_deg < self.spread.between_deg)
 
     def draw(self, count: int, rng: np.random.Generator) -> Floats:
-        """Draw poses, (``count``, 4, 4) ``world_from_cam``; the first of them do not depend on ``count``."""
-        return np.stack([self._draw(rng) for _ in range(count)])
-
-    def _draw(self, rng: np.random.Generator) -> Floats:
-        first = rng.choice(len(self.share), p=self.share)
-        second = rng.choice(np.flatnonzero(self.is_near[first]))
-        way = rng.uniform() if rng.uniform() < 0.5 else 0.0
-        turn = way * rotation_vector_between(self.quaternion[first], self.quaternion[second])
-        noise_rad = np.radians(self.spread.noise_deg) * rng.standard_normal(3)
-        turned = matrix_from_quaternion(quaternion_from_rotation_vector(np.stack((turn, noise_rad))))
-        world_from_cam = np.eye(4)
-        world_from_cam[:3, :3] = matrix_from_quaternion(self.quaternion[first]) @ turned[0] @ turned[1]
-        world_from_cam[:3, 3] = (1 - way) * self.position_m[first] + way * self.position_m[second]
-        world_from_cam[:3, 3] += self.spread.noise * self.scale_m * rng.standard_normal(3)
+        """Draw poses, (``count``, 4, 4) ``world_from_cam``."""
+        first = rng.choice(len(self.share), count, p=self.share)
+        second = (self.is_near[first] * rng.uniform(size=(count, len(self.share)))).argmax(axis=1)
+        way = rng.uniform(size=(count, 1)) * (rng.uniform(size=(count, 1)) < 0.5)
+        turn = quaternion_from_rotation_vector(
+            way * rotation_vector_between(self.quaternion[first], self.quaternion[second])
+        )
+        noise_rad = np.radians(self.spread.noise_deg) * rng.standard_normal((count, 3))
+        quaternion = multiply(multiply(self.quaternion[first], turn), quaternion_from_rotation_vector(noise_rad))
+        world_from_cam = np.tile(np.eye(4), (count, 1, 1))
+        world_from_cam[:, :3, :3] = matrix_from_quaternion(quaternion)
+        world_from_cam[:, :3, 3] = (1 - way) * self.position_m[first] + way * self.position_m[second]
+        world_from_cam[:, :3, 3] += self.spread.noise * self.scale_m * rng.standard_normal((count, 3))
         return world_from_cam

@@ -129,7 +129,7 @@ class Splatter:
         seen = carried(matrix, shift, size, nearest.reshape(views, 1, 1, -1))
         z = seen[:, :, 2].contiguous()
         x, y = (seen[:, :, axis].div(z) for axis in (0, 1))
-        is_inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1) & (z > 0)
+        is_inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5) & (z > 0)
         pixel = torch.where(is_inside, y.round().mul_(width).add_(x.round()), 0).long()
         pixel += frame.clamp(min=0)[..., None] * (height * width)
         ratio = self._depth_m.flatten()[pixel].div_(z)
@@ -144,6 +144,7 @@ class Splatter:
     def _colors_at(self, frame: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Colours of frames at points; all (V, P) -> (V, 3, P)."""
         height, width = self.source.depth_m.shape[1:]
+        x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
         left, top = x.long().clamp(max=width - 2), y.long().clamp(max=height - 2)
         right, below = (x - left)[..., None], (y - top)[..., None]
         corner = (frame.clamp(min=0) * height + top) * width + left

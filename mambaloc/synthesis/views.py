@@ -29,6 +29,7 @@ MOST_HOLES = 0.25
 _VERSION = 1
 _NEAREST = 0.1  # median depths; nearer surfaces would fill the view with a few pixels of a frame
 _MOST_CROWDED = 0.02  # share of pixels nearer than that
+_DRAWN = 64  # poses at once
 _AT_ONCE = {"cpu": 1}  # views; more would not fit a core's cache
 _LEAST_KEPT = 0.02
 _REMEDY = "make room, or choose another folder"
@@ -109,11 +110,12 @@ def _accepted(
     """A part of the views, which depends on nothing but its arguments."""
     kept: list[tuple[NDArray[np.generic], ...]] = []
     rng, tried = np.random.default_rng(seed), 0
-    at_once = _AT_ONCE.get(splatter.device.type, 64)
+    at_once = _AT_ONCE.get(splatter.device.type, _DRAWN)
     while len(kept) < PART:
-        poses = sampler.draw(at_once, rng)
-        tried += at_once
-        kept += list(supported(splatter, poses, intrinsics, size))
+        poses = sampler.draw(_DRAWN, rng)
+        tried += _DRAWN
+        for start in range(0, _DRAWN, at_once):
+            kept += supported(splatter, poses[start : start + at_once], intrinsics, size)
         if tried > PART and len(kept) < _LEAST_KEPT * tried:
             raise InputError(
                 f"depth of {len(splatter.source)} frames: supports {len(kept)} of {tried} views. "

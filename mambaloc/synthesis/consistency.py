@@ -13,7 +13,7 @@ from mambaloc.errors import InputError
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 from mambaloc.synthesis.splatting import between, carried
 
-LEAST_AGREEMENT = 0.6
+LEAST_AGREEMENT = 0.7
 """Share of a frame's depth that others must meet; with sensors and their own poses it is 0.85 and more."""
 
 _OTHERS = 6
@@ -78,6 +78,8 @@ def _ratios(source: PosedDepth, least_apart: float) -> Iterator[Floats]:
 
 def _ratio(source: PosedDepth, row: int, others: NDArray[np.int64]) -> Floats:
     height, width = source.depth_m.shape[1:]
+    if not len(others):
+        return np.full((0, height, width), np.nan)
     from_row = np.full((len(others), 1), row)
     matrix, shift = between(source, from_row, source.world_from_cam[others], source.intrinsics[others])
     depth_m = torch.from_numpy(source.depth_m[row]).reshape(1, 1, 1, -1)
