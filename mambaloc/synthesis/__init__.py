@@ -1,0 +1,30 @@
+"""Novel views: pictures at poses where nobody took one, rendered from posed frames with depth."""
+
+from mambaloc.synthesis.consistency import agreement, confirmed, without_disagreeing
+from mambaloc.synthesis.depth_from_pictures import depth_from_pictures
+from mambaloc.synthesis.gate import Quality, held_out_quality
+from mambaloc.synthesis.plane_sweep import PlaneSweep, SweepSettings
+from mambaloc.synthesis.posed_depth import PosedDepth
+from mambaloc.synthesis.sampling import PoseSampler, Spread
+from mambaloc.synthesis.sensor_depth import carried_depth
+from mambaloc.synthesis.splatting import Rendered, Splatter
+from mambaloc.synthesis.views import Views, make_views
+
+__all__ = [
+    "PlaneSweep",
+    "PoseSampler",
+    "PosedDepth",
+    "Quality",
+    "Rendered",
+    "Splatter",
+    "Spread",
+    "SweepSettings",
+    "Views",
+    "agreement",
+    "carried_depth",
+    "confirmed",
+    "depth_from_pictures",
+    "held_out_quality",
+    "make_views",
+    "without_disagreeing",
+]

@@ -1,0 +1,109 @@
+"""Frames with depth, from posed pictures without any."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mambaloc.errors import InputError
+from mambaloc.synthesis.consistency import confirmed
+from mambaloc.synthesis.plane_sweep import PlaneSweep, SweepSettings
+from mambaloc.synthesis.posed_depth import Floats, PosedDepth
+
+_KEY_FRAMES = 160
+_POINTS_INSIDE = (0.01, 0.99)  # of the depths
+_MARGIN = 1.3
+_TRIAL_FRAMES, _TRIAL_OTHERS = 6, 1
+_TRIAL_RANGE = (0.2, 40.0)  # of how far the cameras are spread
+_LEAST_KNOWN = 0.05
+
+
+def depth_from_pictures(
+    images: NDArray[np.uint8],
+    intrinsics: Floats,
+    world_from_cam: Floats,
+    points_m: Floats | None = None,
+    key_frames: int = _KEY_FRAMES,
+    settings: SweepSettings | None = None,
+    device: torch.device | str = "cpu",
+) -> PosedDepth:
+    """Search depth for some of the pictures, spread over the poses, and keep what several of them confirm.
+
+    Args:
+        images: (N, 3, h, w) uint8.
+        intrinsics: (N, 3, 3) in pixels of the pictures.
+        world_from_cam: (N, 4, 4).
+        points_m: (M, 3), a sparse map's or of structure from motion: they bound the depth. From pictures unless given.
+        key_frames: how many at most.
+        settings: of the search.
+        device: that searches.
+
+    Raises:
+        InputError: where hardly any depth is confirmed: poses or cameras do not fit the pictures.
+    """
+    if points_m is None:
+        range_m = range_from_pictures(images, intrinsics, world_from_cam, device)
+    else:
+        range_m = range_of_points(points_m, intrinsics, world_from_cam, images.shape[2:])
+    sweep = PlaneSweep(images, intrinsics, world_from_cam, range_m, settings, device)
+    rows = spread_rows(world_from_cam, sweep.scale_m, key_frames)
+    found = confirmed(PosedDepth(images[rows], sweep.depth_m(rows), intrinsics[rows], world_from_cam[rows]))
+    if np.isfinite(found.depth_m).mean() < _LEAST_KNOWN:
+        raise InputError(
+            f"{len(images)} pictures: no depth is found that several of them confirm. Check poses and cameras, or "
+            "do without views."
+        )
+    return found
+
+
+def range_of_points(
+    points_m: Floats, intrinsics: Floats, world_from_cam: Floats, size: tuple[int, ...]
+) -> tuple[float, float]:
+    """Nearest and farthest depth at which cameras see points (M, 3), with a margin and without outliers."""
+    depths = []
+    for matrix, pose in zip(intrinsics, world_from_cam, strict=True):
+        x, y, z = matrix @ ((points_m - pose[:3, 3]) @ pose[:3, :3]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            is_seen = (z > 0) & (x / z >= 0) & (x / z < size[1]) & (y / z >= 0) & (y / z < size[0])
+        depths.append(z[is_seen])
+    near_m, far_m = np.quantile(np.concatenate(depths), _POINTS_INSIDE)
+    return near_m / _MARGIN, far_m * _MARGIN
+
+
+def range_from_pictures(
+    images: NDArray[np.uint8], intrinsics: Floats, world_from_cam: Floats, device: torch.device | str = "cpu"
+) -> tuple[float, float]:
+    """Nearest and farthest depth that a few pictures confirm, searched within what the cameras' spread suggests.
+
+    Raises:
+        InputError: where they confirm none.
+    """
+    position_m = world_from_cam[:, :3, 3]
+    spread_m = float(np.median(np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1)))
+    range_m = (_TRIAL_RANGE[0] * spread_m, _TRIAL_RANGE[1] * spread_m)
+    for _ in range(2):  # the first answer chooses better neighbours for the second
+        sweep = PlaneSweep(images, intrinsics, world_from_cam, range_m, device=device)
+        middle = np.linspace(0, len(images) - 1, _TRIAL_FRAMES).round().astype(int).tolist()
+        rows = np.unique([each for row in middle for each in (row, *sweep.neighbours(row)[:_TRIAL_OTHERS])])
+        trial = PosedDepth(images[rows], sweep.depth_m(rows), intrinsics[rows], world_from_cam[rows])
+        known_m = confirmed(trial, by=1).depth_m
+        known_m = known_m[np.isfinite(known_m)]
+        if not len(known_m):
+            raise InputError(
+                f"{len(images)} pictures: none confirms another's depth. Check poses and cameras, or do without views."
+            )
+        near_m, far_m = np.quantile(known_m, _POINTS_INSIDE)
+        range_m = (near_m / _MARGIN, far_m * _MARGIN)
+    return range_m
+
+
+def spread_rows(world_from_cam: Floats, scale_m: float, count: int) -> NDArray[np.int64]:
+    """Frames that are spread over the poses: each the farthest from those before it, in order of their rows."""
+    place = np.hstack((world_from_cam[:, :3, 3] / scale_m, world_from_cam[:, :3, 2]))
+    chosen = [0]
+    apart = np.linalg.norm(place - place[0], axis=1)
+    while len(chosen) < min(count, len(place)):
+        chosen.append(int(apart.argmax()))
+        apart = np.minimum(apart, np.linalg.norm(place - place[chosen[-1]], axis=1))
+    return np.sort(chosen)
