@@ -30,6 +30,11 @@ class MapRecipe:
     settings: MapSettings = field(default_factory=MapSettings)
     ransac_seeds: tuple[int, ...] = (0, 1, 2)
 
+    @property
+    def name(self) -> str:
+        """How results call the scene."""
+        return self.label or Path(self.scene).name
+
 
 _TYPES = {"scene": str, "dataset": str, "root": str, "label": str}
 LEAST = {"key_frames": 2, "width": 32, "most_bytes": 1000, "least_inliers": 4, "seed": 0}

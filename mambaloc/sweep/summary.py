@@ -127,7 +127,7 @@ def differences(
         epoch: ``last`` or ``best``.
 
     Raises:
-        InputError: where the axis has no such label.
+        InputError: where the axis has no such label, or results do not hold errors of the same frames.
     """
     trials = list(trials)
     for label in (before, after):
@@ -178,8 +178,16 @@ Pair = tuple[dict[str, Any], dict[str, Any]]
 def _pairs(group: list[StoredTrial], axis: str, before: str, after: str, epoch: str) -> list[Pair]:
     by_seed: dict[str, dict[str, dict[str, Any]]] = {}
     for trial in group:
-        by_seed.setdefault(trial.labels.get(SEED, ""), {})[trial.labels[axis]] = trial.results[epoch]
-    return [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
+        by_seed.setdefault(trial.labels.get(SEED, ""), {})[trial.labels.get(axis, "")] = trial.results[epoch]
+    pairs = [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
+    for pair in pairs:
+        images = [result.get("frames", {}).get("image") for result in pair]
+        if not images[0] or images[0] != images[1]:
+            raise InputError(
+                f"--compare {axis}: the results of {before} and {after} do not hold errors of the same frames. Run the "
+                "sweep again into an empty folder."
+            )
+    return pairs
 
 
 def _places(

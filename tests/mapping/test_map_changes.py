@@ -1,5 +1,6 @@
 """tools/map.py on a map: what is added, removed, drawn and measured, and wrong uses in one line each."""
 
+import json
 import re
 import runpy
 from pathlib import Path
@@ -55,9 +56,16 @@ def test_pictures_are_added_measured_and_removed_again(folder, pictures, den, tm
     lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
     assert "7 key frames and" in lines[0]
     assert lines[1] == "not found in the map: 1 frames, blank.png"
-    assert lines[-2].startswith("before: ")
-    assert lines[-1].startswith("after: ")
-    assert lines[-1].endswith("100.0 % accepted")
+    assert lines[-3].startswith("before: ")
+    assert lines[-2].startswith("after: ")
+    assert lines[-2].endswith("100.0 % accepted")
+    result = json.loads((out / "metrics.json").read_text())
+    assert lines[-1].startswith(f"den: median {result['metrics']['position_error_m']:.3f} m / ")
+    assert lines[-1].endswith(" ms a query")
+    assert result["map"]["sessions"] == {"balcony": 7}
+    assert result["map"]["settings"] == {"key_frames": 160, "most_bytes": 4 * 2**20}
+    assert result["map"]["core_seconds"] > 0
+    assert result["data"]["train_frames"] == 8
     assert (folder / "map.safetensors").read_bytes() == before
     assert SparseMap.load(out / "map.safetensors").sessions == {"balcony": 7}
     for name in ("coverage.png", "points.png"):

@@ -146,6 +146,19 @@ def test_differences_over_scenes_resample_each_by_itself(tmp_path):
     assert (overall.mean, overall.low, overall.high) == pytest.approx((-0.15, -0.15, -0.15))
 
 
+@pytest.mark.parametrize("images", [None, [], ["seq-01/frame-000000.color.png"]])
+def test_results_of_other_frames_or_none_are_not_compared(tmp_path, images):
+    told = {("a", gis, "0"): result("posenet", gis, [0.5] * FRAMES) for gis in ("none", "gis")}
+    if images is None:
+        del told["a", "gis", "0"]["frames"]
+    else:
+        told["a", "gis", "0"]["frames"]["image"] = images
+    folder = stored(tmp_path / "results", told)
+    with pytest.raises(InputError, match=r"--compare gis: the results of none and gis do not hold errors of the same"):
+        write_report(folder, tmp_path / "report", [("gis", "none", "gis")])
+    assert not (tmp_path / "report").exists()
+
+
 class Tables(HTMLParser):
     """Text of every table's cells."""
 
