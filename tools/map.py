@@ -17,6 +17,7 @@ from pathlib import Path
 from mambaloc.console import exits_cleanly, pinhole_matrix, quieten
 from mambaloc.errors import InputError
 from mambaloc.mapping import MapSettings
+from mambaloc.mapping.building import POINTS, describe_points
 from mambaloc.mapping.evaluating import Making, build_and_measure, measure, measure_saved, read_frames
 from mambaloc.mapping.growing import add_frames, remove_session
 from mambaloc.mapping.new_frames import read_new_frames
@@ -34,6 +35,8 @@ def main(argv: list[str] | None = None) -> None:
     for option, least, value in (("frames", 2, args.frames), ("width", 32, args.width)):
         if value is not None and value < least:
             raise InputError(f"--{option} {value}: is less than {least}. Give more.")
+    if (args.intrinsics is not None or args.name) and not args.add:
+        raise InputError(f"--{'name' if args.name else 'intrinsics'}: is of what --add adds. Leave it out.")
     if args.source.suffix == Path(MAP_FILE).suffix or (args.source / MAP_FILE).is_file():
         _change(args)
     else:
@@ -44,12 +47,14 @@ def _build(args: argparse.Namespace) -> None:
     if args.add or args.remove or args.test:
         raise InputError(f"{args.source}: is not a map, so nothing can be added, removed or tested. Build it first.")
     recipe = recipe_of(args.source)
-    given = {"key_frames": args.frames, "width": args.width}
+    given = {"key_frames": args.frames, "width": args.width, "points": args.points}
     settings = replace(recipe.settings, **{key: value for key, value in given.items() if value is not None})
     out = args.out or Path("runs", args.source.resolve().stem)
     measured = build_and_measure(replace(recipe, settings=settings), out)
     sparse_map = measured.sparse_map
-    print(f"{out}: {MAP_FILE}, metrics.json, coverage.png, points.png")
+    print(f"{out}: {MAP_FILE}, metrics.json, coverage.png, points.png", describe_points(sparse_map), sep="\n")
+    if (cameras := measured.result["map"]["cameras"]) > 1:
+        print(f"{cameras} cameras: their intrinsics are taken as given; a lens is only fitted where there is one")
     print(write_coverage(sparse_map, out / "coverage.png"))
     write_points({"map": sparse_map}, measured.test, out / "points.png", sparse_map.scene)
     print(measured.describe())
@@ -58,6 +63,8 @@ def _build(args: argparse.Namespace) -> None:
 def _change(args: argparse.Namespace) -> None:
     path = args.source / MAP_FILE if args.source.is_dir() else args.source
     before = after = SparseMap.load(path)
+    if args.width or args.points:
+        raise InputError(f"{path}: is built already. Leave out --{'width' if args.width else 'points'}.")
     if (args.add or args.remove) and args.out is None:
         raise InputError(f"{path}: is not overwritten unasked. Give --out FOLDER, which may be {path.parent}.")
     out = args.out or path.parent
@@ -97,6 +104,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--frames", type=int, help="key frames, of the training frames or of those added; 160")
     parser.add_argument("--width", type=int, help="of the pictures in which keypoints are searched, in pixels")
+    parser.add_argument(
+        "--points", choices=POINTS, help="of an imported COLMAP model, or our own; COLMAP's unless given"
+    )
     parser.add_argument("--out", type=Path, help="folder to write to; a new map's is runs/NAME unless given")
     change = parser.add_mutually_exclusive_group()
     change.add_argument(

@@ -144,6 +144,11 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
     )
 
 
+def describe_points(sparse_map: SparseMap) -> str:
+    """How many points a map has, and whose they are."""
+    return f"points {'from COLMAP' if COLMAP_POINTS in sparse_map.digests else 'triangulated'}: {len(sparse_map)}"
+
+
 def _digests(frames: PosedFrames, tracks: Tracks | None) -> dict[str, str]:
     """Of the poses, and of the points of a COLMAP model where they are used."""
     digests = {"poses": hashlib.sha256(frames.world_from_cam.tobytes() + frames.intrinsics.tobytes()).hexdigest()}

@@ -23,7 +23,7 @@ from mambaloc.data.frames import BadFrames, Frames, Split
 from mambaloc.data.tracks import Tracks, read_tracks
 from mambaloc.files import sha256, whole_file, writing
 from mambaloc.images import Image, read_image
-from mambaloc.mapping.building import PosedFrames, build_map
+from mambaloc.mapping.building import PosedFrames, build_map, describe_points
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.metrics import summarise_errors
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
@@ -141,11 +141,13 @@ class Making:
         frames: to choose key frames from.
         settings: of building, or of adding to it.
         core_seconds: CPU time that it took.
+        cameras: of these frames. A lens is only fitted where there is one; of several, intrinsics are taken as given.
     """
 
     frames: int
     settings: dict[str, Any]
     core_seconds: float
+    cameras: int = 1
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,9 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> MeasuredMap:
     sparse_map = build_map(train, recipe.settings, recipe.name)
     core_seconds = time.process_time() - cpu
     sparse_map.save(out / MAP_FILE)
-    return measure_saved(out / MAP_FILE, recipe, test, Making(len(train), asdict(recipe.settings), core_seconds))
+    cameras = len(np.unique(train.intrinsics, axis=0))
+    making = Making(len(train), asdict(recipe.settings), core_seconds, cameras)
+    return measure_saved(out / MAP_FILE, recipe, test, making)
 
 
 def measure_saved(path: Path, recipe: MapRecipe, test: PosedFrames, making: Making) -> MeasuredMap:
@@ -225,6 +229,8 @@ def measure_saved(path: Path, recipe: MapRecipe, test: PosedFrames, making: Maki
         "map": {
             "settings": making.settings,
             "points": len(sparse_map),
+            "points_are": describe_points(sparse_map),
+            "cameras": making.cameras,
             "key_frames": len(sparse_map.key_poses),
             "sessions": sparse_map.sessions,
             "mib": path.stat().st_size / 2**20,

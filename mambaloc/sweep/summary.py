@@ -181,11 +181,10 @@ def _pairs(group: list[StoredTrial], axis: str, before: str, after: str, epoch: 
         by_seed.setdefault(trial.labels.get(SEED, ""), {})[trial.labels.get(axis, "")] = trial.results[epoch]
     pairs = [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
     for pair in pairs:
-        images = [result.get("frames", {}).get("image") for result in pair]
-        if not images[0] or images[0] != images[1]:
+        first, second = (_frames(result)["image"] for result in pair)
+        if first != second:
             raise InputError(
-                f"--compare {axis}: the results of {before} and {after} do not hold errors of the same frames. Run the "
-                "sweep again into an empty folder."
+                f"--compare {axis}: {before} and {after} were measured on different frames. Run them again."
             )
     return pairs
 
@@ -239,13 +238,24 @@ def _map_alone(result: dict[str, Any]) -> dict[str, dict[str, float]]:
     return {name: {error: math.inf if each is None else each for error, each in medians.items()}}
 
 
+def _frames(result: dict[str, Any]) -> dict[str, list[Any]]:
+    """Images and errors of single frames."""
+    frames: dict[str, list[Any]] = result.get("frames", {})
+    if not frames.get("image"):
+        raise InputError(
+            f"{result['data']['scene']}: a result has no errors of single frames, which a report needs. "
+            "Run the sweep into an empty folder."
+        )
+    return frames
+
+
 def _resamples(result: dict[str, Any]) -> NDArray[np.int64]:
-    return block_resamples([image.rpartition("/")[0] for image in result["frames"]["image"]])
+    return block_resamples([image.rpartition("/")[0] for image in _frames(result)["image"]])
 
 
 def _medians(result: dict[str, Any], name: str, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """The median over all frames, then those of each resample."""
-    errors = np.array(result["frames"][name])
+    errors = np.array(_frames(result)[name])
     return np.array([np.median(errors), *np.median(errors[rows], axis=1)])
 
 
