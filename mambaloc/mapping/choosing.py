@@ -34,10 +34,12 @@ def most_useful(seen: Observations, points: int, most: int, width: float) -> Ind
         width: of the pictures, in the plane at depth 1.
 
     Returns:
-        Rows of points, those that most key frames see first.
+        Rows of points, those that most key frames see first; in no order where as many see them.
     """
     views = np.unique(np.stack((seen.track, seen.frame)), axis=1)[0]
     chosen = np.arange(points) if points <= most else _cover(seen.track, _cells(seen, width / _CELLS), points, most)
+    # In the order of frames, the first of many that two frames see would all be of one place.
+    chosen = np.random.default_rng(0).permutation(chosen)
     return chosen[np.argsort(-np.bincount(views, minlength=points)[chosen], kind="stable")]
 
 

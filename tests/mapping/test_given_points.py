@@ -11,7 +11,7 @@ from mambaloc.mapping.building import describe_points
 from mambaloc.mapping.evaluating import measure
 from mambaloc.runtime.maps.features import detect_features
 
-SETTINGS = MapSettings(key_frames=40, width=160)
+SETTINGS = MapSettings(key_frames=40, width=160, points="colmap")
 
 
 @pytest.fixture(scope="module")
