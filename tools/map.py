@@ -104,9 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--frames", type=int, help="key frames, of the training frames or of those added; 160")
     parser.add_argument("--width", type=int, help="of the pictures in which keypoints are searched, in pixels")
-    parser.add_argument(
-        "--points", choices=POINTS, help="of an imported COLMAP model, or our own; COLMAP's unless given"
-    )
+    parser.add_argument("--points", choices=POINTS, help="our own unless given, or those of an imported COLMAP model")
     parser.add_argument("--out", type=Path, help="folder to write to; a new map's is runs/NAME unless given")
     change = parser.add_mutually_exclusive_group()
     change.add_argument(

@@ -89,11 +89,13 @@ def add_frames(
         most_bytes: budget of the points and descriptors that are added.
 
     Raises:
-        InputError: for a session that the map has already, where no frame is found, or where all poses contradict
-            those given.
+        InputError: for a session that the map has already or a name that it uses itself, where no frame is found, or
+            where all poses contradict those given.
     """
     if session in sparse_map.sessions:
         raise InputError(f"{session}: was added before. Remove that first, or add these under another --name.")
+    if session in sparse_map.digests:
+        raise InputError(f"{session}: is a name that the map uses itself. Give another --name.")
     matched = functools.cache(lambda first, second: match(frames[first].features, frames[second].features))
     poses: dict[int, CameraPose] = {}
     grown, rounds, contradict = sparse_map, 0, 0

@@ -128,6 +128,8 @@ def test_the_same_name_is_not_added_twice(growths, walk):
     grown = growths[False].sparse_map
     with pytest.raises(InputError, match=r"second: was added before\. .* --name"):
         add_frames(grown, _new(grown, walk, ROWS[:2], False), "second", 20)
+    with pytest.raises(InputError, match=r"^poses: is a name that the map uses itself\. Give another --name\."):
+        add_frames(grown, _new(grown, walk, ROWS[:2], False), "poses", 20)
 
 
 def test_key_frames_are_limited_and_spread(part, walk):
