@@ -17,6 +17,7 @@ from mambaloc.data.datasets.capture import CAPTURE
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.mapping import MapSettings, build_map
+from mambaloc.mapping.building import POINTS, describe_points
 from mambaloc.mapping.evaluating import with_cameras
 from mambaloc.mapping.recipe import LEAST
 from mambaloc.runtime.maps import SparseMap
@@ -43,6 +44,8 @@ class MapBuild(L.Callback):
         for name, least in LEAST.items():
             if (value := getattr(self.settings, name)) < least:
                 raise InputError(f"map.{name} {value}: is less than {least}. Give more.")
+        if self.settings.points not in POINTS:
+            raise InputError(f"map.points {str(self.settings.points)[:40]}: is unknown. Choose {' or '.join(POINTS)}.")
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Build, or find it built."""
@@ -66,7 +69,7 @@ class MapBuild(L.Callback):
             return
         replace(sparse_map, digests={**sparse_map.digests, **digests}).save(path)
         print(
-            f"{path}: {len(sparse_map)} points from {len(sparse_map.key_poses)} key frames, "
+            f"{path}: {describe_points(sparse_map)}, in {len(sparse_map.key_poses)} key frames, "
             f"{path.stat().st_size / 2**20:.2f} MiB, built in {time.perf_counter() - started:.1f} s; "
             "tools/localize.py localises with it already",
             flush=True,

@@ -10,6 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mambaloc.data.tracks import Tracks
+
 Unit = Literal["metre", "unknown"]
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -70,6 +72,7 @@ class Capture:
         poses_without_image: what the format names and is not there.
         images_without_pose: images beside those used.
         depth: of the images, where the format has it and the images are those of a pinhole.
+        tracks: points that the format says the images see.
     """
 
     kind: str
@@ -85,3 +88,4 @@ class Capture:
     poses_without_image: tuple[str, ...] = ()
     images_without_pose: tuple[Path, ...] = ()
     depth: Depth | None = None
+    tracks: Tracks | None = None

@@ -70,6 +70,8 @@ def import_scene(
         written, sizes, rules = write_pictures(capture, partial)
         imported = _checked(written, capture.cameras, sizes, {**broken, **far, **rules}, split, with_adjusted)
         write_frames(imported, partial)
+        if imported.capture.tracks:
+            imported.capture.tracks.write(partial)
         write_report(imported, partial, out.name)
         write_scene(imported, partial, source, command)
     return imported
@@ -91,7 +93,8 @@ def _in_metres(capture: Capture, metres_per_unit: float | None) -> Capture:
     )
     depth = capture.depth and replace(capture.depth, step=capture.depth.step * metres_per_unit)
     choices = {**capture.choices, "scale": told}
-    return replace(capture, world_from_cam=world_from_cam, unit="metre", choices=choices, depth=depth)
+    tracks = capture.tracks and capture.tracks.moved(metres_per_unit, np.zeros(3))
+    return replace(capture, world_from_cam=world_from_cam, unit="metre", choices=choices, depth=depth, tracks=tracks)
 
 
 def _near_the_origin(capture: Capture) -> Capture:
@@ -104,7 +107,8 @@ def _near_the_origin(capture: Capture) -> Capture:
     world_from_cam = capture.world_from_cam.copy()
     world_from_cam[:, :3, 3] -= middle
     told = f"shifted to {middle.tolist()} of the source's world, so that float32 holds the positions"
-    return replace(capture, world_from_cam=world_from_cam, choices={**capture.choices, "origin": told})
+    tracks = capture.tracks and capture.tracks.moved(1.0, -middle)
+    return replace(capture, world_from_cam=world_from_cam, choices={**capture.choices, "origin": told}, tracks=tracks)
 
 
 def _checked(

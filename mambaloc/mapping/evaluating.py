@@ -19,14 +19,16 @@ from scipy.stats import chi2
 from mambaloc import provenance
 from mambaloc.console import progress
 from mambaloc.data.cameras import frame_intrinsics
+from mambaloc.data.datasets.capture import is_captured, read_rows
 from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, Split
+from mambaloc.data.tracks import Tracks, read_tracks
 from mambaloc.files import sha256, whole_file, writing
-from mambaloc.images import read_image
-from mambaloc.mapping.building import PosedFrames, build_map
+from mambaloc.images import Image, read_image
+from mambaloc.mapping.building import PosedFrames, build_map, describe_points
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.metrics import summarise_errors
-from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
 from mambaloc.runtime.maps.radii import LEVEL
 from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_error_deg
 
@@ -94,26 +96,51 @@ def read_frames(recipe: MapRecipe, split: Split) -> PosedFrames:
 
 
 def with_cameras(dataset: str, folder: Path, frames: Frames) -> PosedFrames:
-    """Add the cameras to frames of a scene.
+    """Add the cameras to frames of a scene, and the points that it was imported with.
 
     Raises:
-        InputError: where they are unknown.
+        InputError: where cameras are unknown, or the points' file is damaged.
     """
-    return PosedFrames(frames.image_paths, frame_intrinsics(dataset, folder, frames), _world_from_cam(frames))
+    intrinsics, poses = frame_intrinsics(dataset, folder, frames), _world_from_cam(frames)
+    return PosedFrames(frames.image_paths, intrinsics, poses, _tracks(folder, frames) if is_captured(folder) else None)
+
+
+def localise_frames(
+    localiser: MapLocaliser,
+    images: Sequence[Path | Image],
+    intrinsics: Floats,
+    priors: Sequence[CameraPose | None] | None = None,
+) -> tuple[list[MapLocalisation], Floats]:
+    """Localise pictures one after another.
+
+    Args:
+        localiser: in the map.
+        images: paths or RGB arrays (H, W, 3), N of them.
+        intrinsics: (N, 3, 3).
+        priors: a pose to search around, of each picture that has one.
+
+    Returns:
+        The answers, and the CPU seconds that each took on all cores, without decoding the picture, (N,).
+
+    Raises:
+        InputError: for a bad picture.
+    """
+    found, cpu_s = [], []
+    rows = zip(images, intrinsics, priors or [None] * len(images), strict=True)
+    for image, matrix, prior in progress(rows, "queries", len(images)):
+        rgb = read_image(image) if isinstance(image, Path) else image
+        start = time.process_time()
+        found.append(localiser.localise(rgb, matrix, prior))
+        cpu_s.append(time.process_time() - start)
+    return found, np.array(cpu_s)
 
 
 def measure(sparse_map: SparseMap, frames: PosedFrames, seeds: Sequence[int]) -> MapErrors:
-    """Localise frames in a map, once a seed; time is this process's own on all cores, without decoding the picture."""
-    localisers = [MapLocaliser(sparse_map, seed) for seed in seeds]
+    """Localise frames in a map, once with each RANSAC seed."""
     rows = []
-    for image, intrinsics, truth in progress(
-        zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True), "queries", len(frames)
-    ):
-        rgb = read_image(image) if isinstance(image, Path) else image
-        for localiser in localisers:
-            start = time.process_time()
-            found = localiser.localise(rgb, intrinsics)
-            taken_s = time.process_time() - start
+    for seed in seeds:
+        answers, cpu_s = localise_frames(MapLocaliser(sparse_map, seed), frames.images, frames.intrinsics)
+        for found, taken_s, truth in zip(answers, cpu_s, frames.world_from_cam, strict=True):
             off_m = np.linalg.norm(found.position_m - truth[:3, 3])
             off_deg = rotation_error_deg(found.quaternion, quaternion_from_matrix(truth[:3, :3]))
             inside = covers(found.position_m, found.quaternion, found.covariance, truth)
@@ -134,44 +161,110 @@ def covers(position_m: ArrayLike, quaternion: ArrayLike, covariance: ArrayLike |
     )
 
 
-def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Making:
+    """How a map was made.
+
+    Args:
+        frames: to choose key frames from.
+        settings: of building, or of adding to it.
+        core_seconds: CPU time that it took.
+        cameras: of these frames. A lens is only fitted where there is one; of several, intrinsics are taken as given.
+    """
+
+    frames: int
+    settings: dict[str, Any]
+    core_seconds: float
+    cameras: int = 1
+
+
+@dataclass(frozen=True)
+class MeasuredMap:
+    """A map, the test frames that it was measured on, and the result.
+
+    Args:
+        sparse_map: the map.
+        test: frames.
+        errors: how it localised them.
+        result: what ``metrics.json`` says, with infinity where that has null.
+    """
+
+    sparse_map: SparseMap
+    test: PosedFrames
+    errors: MapErrors
+    result: dict[str, Any]
+
+    def describe(self) -> str:
+        """The result in one line."""
+        metrics, made = self.result["metrics"], self.result["map"]
+        return (
+            f"{self.result['label']}: "
+            f"median {metrics['position_error_m']:.3f} m / {metrics['rotation_error_deg']:.2f} deg, "
+            f"mean {metrics['position_error_mean_m']:.3f} / {metrics['rotation_error_mean_deg']:.2f}, "
+            f"worst {metrics['position_error_worst_m']:.2f} m, "
+            f"{100 * metrics['recall_10cm_5deg']:.1f} % within 10 cm 5 deg, {made['mib']:.2f} MiB, "
+            f"{made['core_seconds']:.1f} core-seconds, {metrics['query_cpu_ms']:.0f} ms a query"
+        )
+
+
+def build_and_measure(recipe: MapRecipe, out: Path) -> MeasuredMap:
     """Build a recipe's map from its training frames, measure it on its test frames, and write both to a folder.
 
     Writes ``map.safetensors`` and ``metrics.json``.
-
-    Returns:
-        What ``metrics.json`` holds, with infinity where that has null.
 
     Raises:
         InputError: as :func:`read_frames` and :func:`~mambaloc.mapping.building.build_map`, and for a folder that
             cannot be written.
     """
     train, test = read_frames(recipe, "train"), read_frames(recipe, "test")
-    name = recipe.label or Path(recipe.scene).name
-    started, cpu = time.perf_counter(), time.process_time()
-    sparse_map = build_map(train, recipe.settings, name)
+    cpu = time.process_time()
+    sparse_map = build_map(train, recipe.settings, recipe.name)
     core_seconds = time.process_time() - cpu
     sparse_map.save(out / MAP_FILE)
-    metrics = measure(sparse_map, test, recipe.ransac_seeds).summary()
+    cameras = len(np.unique(train.intrinsics, axis=0))
+    making = Making(len(train), asdict(recipe.settings), core_seconds, cameras)
+    return measure_saved(out / MAP_FILE, recipe, test, making)
+
+
+def measure_saved(path: Path, recipe: MapRecipe, test: PosedFrames, making: Making) -> MeasuredMap:
+    """Measure a map's file on test frames, and write ``metrics.json`` beside it.
+
+    Args:
+        path: the map's file.
+        recipe: names the scene and the RANSAC seeds.
+        test: frames of it.
+        making: how the map was made.
+
+    Raises:
+        InputError: for a map or a picture that cannot be read, or a folder that cannot be written.
+    """
+    sparse_map = SparseMap.load(path)
+    started = time.perf_counter()
+    errors = measure(sparse_map, test, recipe.ransac_seeds)
+    metrics = errors.summary()
     result = {
         "metrics": metrics,
-        "label": name,
+        "label": recipe.name,
         "split": "test",
         "count": len(test),
         "ransac_seeds": list(recipe.ransac_seeds),
         "data": {
             "dataset": recipe.dataset,
             "scene": recipe.scene,
-            "train_frames": len(train),
+            "train_frames": making.frames,
             "test_frames": len(test),
         },
         "map": {
-            "settings": asdict(recipe.settings),
+            "settings": making.settings,
             "points": len(sparse_map),
-            "mib": (out / MAP_FILE).stat().st_size / 2**20,
-            "sha256": sha256(out / MAP_FILE),
+            "points_are": describe_points(sparse_map),
+            "cameras": making.cameras,
+            "key_frames": len(sparse_map.key_poses),
+            "sessions": sparse_map.sessions,
+            "mib": path.stat().st_size / 2**20,
+            "sha256": sha256(path),
             "digests": sparse_map.digests,
-            "core_seconds": core_seconds,
+            "core_seconds": making.core_seconds,
         },
         "evaluation": {
             "commit": provenance.commit(),
@@ -184,21 +277,16 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> dict[str, Any]:
     }
     # JSON has no infinity, which the worst error is where a frame has no pose.
     finite = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
-    with writing(out), whole_file(out / "metrics.json") as partial:
+    with writing(path.parent), whole_file(path.parent / "metrics.json") as partial:
         partial.write_text(json.dumps({**result, "metrics": finite}, indent=2) + "\n", encoding="utf-8")
-    return result
+    return MeasuredMap(sparse_map, test, errors, result)
 
 
-def describe(result: dict[str, Any]) -> str:
-    """A result in one line."""
-    metrics, made = result["metrics"], result["map"]
-    return (
-        f"{result['label']}: median {metrics['position_error_m']:.3f} m / {metrics['rotation_error_deg']:.2f} deg, "
-        f"mean {metrics['position_error_mean_m']:.3f} / {metrics['rotation_error_mean_deg']:.2f}, "
-        f"worst {metrics['position_error_worst_m']:.2f} m, "
-        f"{100 * metrics['recall_10cm_5deg']:.1f} % within 10 cm 5 deg, {made['mib']:.2f} MiB, "
-        f"{made['core_seconds']:.1f} core-seconds, {metrics['query_cpu_ms']:.0f} ms a query"
-    )
+def _tracks(folder: Path, frames: Frames) -> Tracks | None:
+    """Points that the scene was imported with and these frames see."""
+    row_of = {row.image: number for number, row in enumerate(read_rows(folder))}
+    tracks = read_tracks(folder, len(row_of))
+    return tracks and tracks.of_frames(np.array([row_of[image] for image in frames.image_paths]))
 
 
 def _world_from_cam(frames: Frames) -> Floats:

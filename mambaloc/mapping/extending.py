@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.mapping.adjusting import Bundle, adjust
+from mambaloc.mapping.choosing import most_useful
 from mambaloc.mapping.pairs import pairs_by_pose
-from mambaloc.mapping.structure import DRIFT, DRIFT_RAD, mean_descriptors, triangulated
+from mambaloc.mapping.structure import DRIFT, DRIFT_RAD, mean_descriptors, triangulated, views_of
 from mambaloc.mapping.tracks import agreeing
 from mambaloc.mapping.triangulation import Observations
 from mambaloc.runtime.maps import CameraPose, MapLocaliser
@@ -52,6 +53,7 @@ def extend(
     matched: Callable[[int, int], Indices],
     world_from_cam: Floats,
     given: Floats | None,
+    most_points: int,
 ) -> Extension:
     """Adjust the poses of new key frames to the map's points, which stay, and to points that they see together.
 
@@ -61,6 +63,7 @@ def extend(
         matched: rows of keypoints that match between two of them, (M, 2).
         world_from_cam: where the map found it, (N, 4, 4).
         given: the same from elsewhere, a prior; None where that is not known.
+        most_points: new points to keep.
     """
     sparse_map, rng, poses = localiser.map, np.random.default_rng(0), world_from_cam
     unit_m = spread_m(sparse_map.key_poses)
@@ -77,11 +80,10 @@ def extend(
             sigma = _SIGMA * near_px * unit_px / focal_px
             prior = poses if given is None else given
             poses = adjust(start, prior, drift, both, sigma, False, is_fixed=is_fixed).world_from_cam
-    descriptors, views = mean_descriptors(features, len(points_m), seen, keypoint)
-    order = np.argsort(-views.sum(axis=1), kind="stable")
-    old = np.zeros((len(sparse_map), len(features)), bool)
-    old[known.track, known.frame] = True
-    return Extension(poses, old, points_m[order], descriptors[order], views[order])
+    descriptors = mean_descriptors(features, len(points_m), seen, keypoint)
+    kept = most_useful(seen, len(points_m), most_points, sparse_map.size[0] / focal_px)
+    old, new = (views_of(each, count, len(poses)) for each, count in ((known, len(sparse_map)), (seen, len(points_m))))
+    return Extension(poses, old, points_m[kept], descriptors[kept], new[kept])
 
 
 def _known(

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.mapping.choosing import bytes_each
 from mambaloc.mapping.extending import extend
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.runtime.maps.drift import drift_moves, drift_weights, known_moves
 from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.viewpoints import spread_m
 
@@ -71,7 +73,9 @@ class Growth:
         return text
 
 
-def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, most: int) -> Growth:
+def add_frames(
+    sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, most: int, most_bytes: int = 4 * 2**20
+) -> Growth:
     """Localise frames in a map, make key frames of those found, and triangulate what these add.
 
     A frame may be found only once its neighbours were added, so that is repeated until nothing more is found. Keypoints
@@ -82,13 +86,16 @@ def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, 
         frames: what to add.
         session: a name by which :func:`remove_session` removes all of it.
         most: key frames to add; they are spread over the poses found.
+        most_bytes: budget of the points and descriptors that are added.
 
     Raises:
-        InputError: for a session that the map has already, where no frame is found, or where all poses contradict
-            those given.
+        InputError: for a session that the map has already or a name that it uses itself, where no frame is found, or
+            where all poses contradict those given.
     """
     if session in sparse_map.sessions:
         raise InputError(f"{session}: was added before. Remove that first, or add these under another --name.")
+    if session in sparse_map.digests:
+        raise InputError(f"{session}: is a name that the map uses itself. Give another --name.")
     matched = functools.cache(lambda first, second: match(frames[first].features, frames[second].features))
     poses: dict[int, CameraPose] = {}
     grown, rounds, contradict = sparse_map, 0, 0
@@ -99,7 +106,7 @@ def add_frames(sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, 
         if not found:
             break
         poses |= found
-        grown, key = _grown(sparse_map, frames, matched, poses, session, most)
+        grown, key = _grown(sparse_map, frames, matched, poses, session, most, most_bytes)
     if not poses:
         raise InputError(_why_none(session, len(frames), contradict))
     lost = [frame.name for row, frame in enumerate(frames) if row not in poses]
@@ -121,16 +128,20 @@ def remove_session(sparse_map: SparseMap, session: str) -> SparseMap:
     later = sum(sparse_map.sessions[name] for name in names[names.index(session) + 1 :])
     end = len(sparse_map.key_poses) - later
     gone = np.arange(end - sparse_map.sessions[session], end)
+    key_poses = np.delete(sparse_map.key_poses, gone, axis=0)
     is_seen = np.delete(sparse_map.is_seen, gone, axis=1)
     kept = is_seen.any(axis=1)
+    drift, first_drift = _drift(sparse_map, key_poses, np.delete(_moves(sparse_map), gone, axis=0))
     return replace(
         sparse_map,
         points_m=sparse_map.points_m[kept],
         descriptors=sparse_map.descriptors[kept],
         views=np.packbits(is_seen[kept], axis=1),
-        key_poses=np.delete(sparse_map.key_poses, gone, axis=0),
+        key_poses=key_poses,
         digests=_without(sparse_map.digests, session),
         sessions=_without(sparse_map.sessions, session),
+        drift=drift,
+        first_drift=first_drift,
     )
 
 
@@ -157,33 +168,67 @@ def _grown(
     poses: dict[int, CameraPose],
     session: str,
     most: int,
+    most_bytes: int,
 ) -> tuple[SparseMap, list[int]]:
     """The map with frames whose poses are known, and which became key frames; their poses are adjusted in place."""
     rows = np.array(sorted(poses))
     key = rows[farthest_first(np.stack([poses[row].matrix for row in rows]), most)].tolist()
     localiser = MapLocaliser(sparse_map)
-    given = [localiser.drift.to_adjusted(pose).matrix for row in key if (pose := frames[row].given) is not None]
+    given = [pose for row in key if (pose := frames[row].given) is not None]
+    is_given = len(given) == len(key)
     new = extend(
         localiser,
         [frames[row].features for row in key],
         lambda first, second: matched(key[first], key[second]),
         np.stack([poses[row].matrix for row in key]),
-        np.stack(given) if len(given) == len(key) else None,
+        np.stack([localiser.drift.to_adjusted(pose).matrix for pose in given]) if is_given else None,
+        most_bytes // bytes_each(len(sparse_map.key_poses) + len(key)),
     )
     for row, pose in zip(key, new.world_from_cam, strict=True):
         poses[row] = CameraPose(pose[:3, :3], pose[:3, 3])
     unseen = np.zeros((len(new.points_m), len(sparse_map.key_poses)), bool)
     views = np.block([[sparse_map.is_seen, new.views], [unseen, new.new_views]])
+    key_poses = np.concatenate((sparse_map.key_poses, new.world_from_cam)).astype(np.float64)
+    moves = np.full((len(key), 6), np.nan)
+    if is_given:
+        moves = drift_moves(new.world_from_cam, np.stack([pose.matrix for pose in given]))
+    drift, first_drift = _drift(sparse_map, key_poses, np.concatenate((_moves(sparse_map), moves)))
     grown = replace(
         sparse_map,
         points_m=np.concatenate((sparse_map.points_m, new.points_m.astype(np.float32))),
         descriptors=np.concatenate((sparse_map.descriptors, quantized(new.descriptors))),
         views=np.packbits(views, axis=1),
-        key_poses=np.concatenate((sparse_map.key_poses, new.world_from_cam)),
+        key_poses=key_poses,
         digests={**sparse_map.digests, session: hashlib.sha256(new.world_from_cam.tobytes()).hexdigest()},
         sessions={**sparse_map.sessions, session: len(key)},
+        drift=drift,
+        first_drift=first_drift,
     )
     return grown, key
+
+
+def _moves(sparse_map: SparseMap) -> Floats:
+    """From adjusted to given poses, of each key frame (K, 6); NaN where none was given."""
+    moves = np.full((len(sparse_map.key_poses), 6), np.nan)
+    moves[: _first(sparse_map)] = 0  # of a map whose frame is its own
+    if known := len(sparse_map.drift):
+        moves[:known] = known_moves(sparse_map.key_poses[:known], sparse_map.drift)
+    return moves
+
+
+def _drift(sparse_map: SparseMap, key_poses: Floats, moves: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The drift of a map once it has other key frames, and that of the first ones alone, which is kept bit for bit."""
+    first = _first(sparse_map)
+    alone = sparse_map.first_drift if sparse_map.has_grown_drift else sparse_map.drift
+    known = 1 + int(np.flatnonzero(np.isfinite(moves[:, 0]))[-1])
+    if known <= first:
+        return alone, np.zeros((0, 6))
+    return drift_weights(key_poses[:known], moves[:known]), alone
+
+
+def _first(sparse_map: SparseMap) -> int:
+    """How many key frames the map was built from."""
+    return len(sparse_map.key_poses) - sum(sparse_map.sessions.values())
 
 
 def _agree(pose: CameraPose, given: CameraPose, unit_m: float) -> bool:

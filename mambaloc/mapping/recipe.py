@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mambaloc.errors import InputError
 from mambaloc.files import read_yaml
-from mambaloc.mapping.building import MapSettings
+from mambaloc.mapping.building import POINTS, MapSettings
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,11 @@ class MapRecipe:
     settings: MapSettings = field(default_factory=MapSettings)
     ransac_seeds: tuple[int, ...] = (0, 1, 2)
 
+    @property
+    def name(self) -> str:
+        """How results call the scene."""
+        return self.label or Path(self.scene).name
+
 
 _TYPES = {"scene": str, "dataset": str, "root": str, "label": str}
 LEAST = {"key_frames": 2, "width": 32, "most_bytes": 1000, "least_inliers": 4, "seed": 0}
@@ -50,15 +55,17 @@ def read_recipe(path: Path) -> MapRecipe:
             fits, what = isinstance(value, str), "a text"
         elif key in LEAST:
             fits, what = _is_int(value, LEAST[key]), f"a whole number of {LEAST[key]} or more"
+        elif key == "points":
+            fits, what = value in POINTS, " or ".join(POINTS)
         elif key == "ransac_seeds":
             fits = isinstance(value, list) and len(value) > 0 and all(_is_int(seed, 0) for seed in value)
             what = "a list of whole numbers"
         else:
-            known = ", ".join((*_TYPES, *LEAST, "ransac_seeds"))
+            known = ", ".join((*_TYPES, *LEAST, "points", "ransac_seeds"))
             raise InputError(f"{path}: {key!r} is unknown. Choose among {known}.")
         if not fits:
             raise InputError(f"{path}: {key} is {str(value)[:40]!r}. Give {what}.")
-    settings = MapSettings(**{key: value for key, value in data.items() if key in LEAST})
+    settings = MapSettings(**{key: value for key, value in data.items() if key in (*LEAST, "points")})
     texts = {key: value for key, value in data.items() if key in _TYPES}
     return MapRecipe(**texts, settings=settings, ransac_seeds=tuple(data.get("ransac_seeds", (0, 1, 2))))
 

@@ -127,7 +127,7 @@ def differences(
         epoch: ``last`` or ``best``.
 
     Raises:
-        InputError: where the axis has no such label.
+        InputError: where the axis has no such label, or results do not hold errors of the same frames.
     """
     trials = list(trials)
     for label in (before, after):
@@ -178,8 +178,15 @@ Pair = tuple[dict[str, Any], dict[str, Any]]
 def _pairs(group: list[StoredTrial], axis: str, before: str, after: str, epoch: str) -> list[Pair]:
     by_seed: dict[str, dict[str, dict[str, Any]]] = {}
     for trial in group:
-        by_seed.setdefault(trial.labels.get(SEED, ""), {})[trial.labels[axis]] = trial.results[epoch]
-    return [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
+        by_seed.setdefault(trial.labels.get(SEED, ""), {})[trial.labels.get(axis, "")] = trial.results[epoch]
+    pairs = [(of[before], of[after]) for of in by_seed.values() if before in of and after in of]
+    for pair in pairs:
+        first, second = (_frames(result)["image"] for result in pair)
+        if first != second:
+            raise InputError(
+                f"--compare {axis}: {before} and {after} were measured on different frames. Run them again."
+            )
+    return pairs
 
 
 def _places(
@@ -231,13 +238,24 @@ def _map_alone(result: dict[str, Any]) -> dict[str, dict[str, float]]:
     return {name: {error: math.inf if each is None else each for error, each in medians.items()}}
 
 
+def _frames(result: dict[str, Any]) -> dict[str, list[Any]]:
+    """Images and errors of single frames."""
+    frames: dict[str, list[Any]] = result.get("frames", {})
+    if not frames.get("image"):
+        raise InputError(
+            f"{result['data']['scene']}: a result has no errors of single frames, which a report needs. "
+            "Run the sweep into an empty folder."
+        )
+    return frames
+
+
 def _resamples(result: dict[str, Any]) -> NDArray[np.int64]:
-    return block_resamples([image.rpartition("/")[0] for image in result["frames"]["image"]])
+    return block_resamples([image.rpartition("/")[0] for image in _frames(result)["image"]])
 
 
 def _medians(result: dict[str, Any], name: str, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """The median over all frames, then those of each resample."""
-    errors = np.array(result["frames"][name])
+    errors = np.array(_frames(result)[name])
     return np.array([np.median(errors), *np.median(errors[rows], axis=1)])
 
 

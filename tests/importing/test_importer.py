@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.data.datasets.capture import COLUMNS, read_rows, read_split
 from mambaloc.data.frames import BadFrames
+from mambaloc.data.tracks import Tracks, read_tracks
 from mambaloc.errors import InputError
 from mambaloc.images import read_image
 from mambaloc.importing.canonical import Imported
@@ -25,6 +26,7 @@ from mambaloc.importing.capture import Camera
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import FORMATS, Format, read_capture
 from mambaloc.importing.undistort.pictures import selected, write_pictures
+from mambaloc.mapping.evaluating import with_cameras
 from mambaloc.rendering import render
 
 TOOL = Path(__file__).parents[2] / "tools" / "import_scene.py"
@@ -151,6 +153,28 @@ def test_a_world_far_away_is_shifted(rendered, tmp_path):
         np.diff(poses[:, :3], axis=0), np.diff(rendered.world_from_cam[:, :3, 3], axis=0), atol=1e-8
     )
     assert "shifted to [449999.0, 5200000.0" in told(tmp_path / "a")["choices"]["origin"]
+
+
+def test_points_of_the_source_come_along(rendered_once, tmp_path, monkeypatch):
+    """In metres, and in the order of frames.csv without the frame whose image is broken."""
+    capture = read_capture(rendered_once.folder)
+    rows = np.arange(len(capture.images))
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no image")
+    images = (capture.images[0], broken, *capture.images[2:])
+    tracks = Tracks(np.ones((1, 3)), 0 * rows, rows, np.column_stack((rows, rows)) / 100.0)
+    given = replace(capture, images=images, tracks=tracks)
+    monkeypatch.setattr("mambaloc.importing.importer.read_capture", lambda *_: given)
+    import_scene(rendered_once.folder, tmp_path / "room", metres_per_unit=2.0)
+    found = read_tracks(tmp_path / "room", len(rows) - 1)
+    assert found.points_m.tolist() == [[2, 2, 2]]
+    assert found.frame.tolist() == list(range(len(rows) - 1))
+    np.testing.assert_array_equal(found.rays[:, 0], np.delete(rows, 1) / 100.0)
+    train = read_split(tmp_path / "room", "train", BadFrames())
+    posed = with_cameras("capture", tmp_path / "room", train)
+    names = [row.image for row in read_rows(tmp_path / "room")]
+    expected = [found.rays[names.index(image), 0] for image in train.image_paths]
+    assert posed.tracks.rays[np.argsort(posed.tracks.frame), 0].tolist() == expected
 
 
 def test_the_report_compares_poses_with_pictures(scene):

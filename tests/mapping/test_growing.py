@@ -93,10 +93,43 @@ def test_sessions_are_removed_in_any_order(growths, part, walk):
         remove_session(left, "second")
 
 
+def test_answers_near_added_frames_are_in_the_frame_of_their_given_poses(part, walk):
+    """New frames say that they are 2 cm to the right of where the map has them, and the first ones do not.
+
+    Measured: where the session was filmed, answers are 20 mm to the right; where the map was, 2 mm.
+    """
+    frames = _new(part, walk, ROWS, True)
+    shift = np.array((0.02, 0, 0))
+    moved = [
+        dataclasses.replace(frame, given=CameraPose(frame.given.rotation, frame.given.position_m + shift))
+        for frame in frames
+    ]
+    grown = add_frames(part, moved, "second", 20).sparse_map
+    assert len(grown.drift) == len(grown.key_poses)
+    localiser = MapLocaliser(grown)
+    for rows, right in ((np.arange(51, 57, 2), shift), (np.arange(5, 15, 3), 0 * shift)):
+        these = walk.frames.select(rows)
+        found = [
+            localiser.localise(image, k).position_m for image, k in zip(these.images, these.intrinsics, strict=True)
+        ]
+        off = np.median(np.array(found) - these.world_from_cam[:, :3, 3], axis=0)
+        np.testing.assert_allclose(off, right, atol=0.008)
+    _assert_same(remove_session(grown, "second"), part)
+
+
+def test_what_is_added_has_a_budget(part, walk):
+    grown = add_frames(part, _new(part, walk, ROWS, True), "second", 20, most_bytes=20_000).sparse_map
+    added = len(grown) - len(part)
+    assert added == 20_000 // (12 + 128 + grown.views.shape[1])
+    assert grown.is_seen[len(part) :, len(part.key_poses) :].any(axis=0).all()
+
+
 def test_the_same_name_is_not_added_twice(growths, walk):
     grown = growths[False].sparse_map
     with pytest.raises(InputError, match=r"second: was added before\. .* --name"):
         add_frames(grown, _new(grown, walk, ROWS[:2], False), "second", 20)
+    with pytest.raises(InputError, match=r"^poses: is a name that the map uses itself\. Give another --name\."):
+        add_frames(grown, _new(grown, walk, ROWS[:2], False), "poses", 20)
 
 
 def test_key_frames_are_limited_and_spread(part, walk):

@@ -1,5 +1,6 @@
 """tools/map.py on a map: what is added, removed, drawn and measured, and wrong uses in one line each."""
 
+import json
 import re
 import runpy
 from pathlib import Path
@@ -55,9 +56,16 @@ def test_pictures_are_added_measured_and_removed_again(folder, pictures, den, tm
     lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
     assert "7 key frames and" in lines[0]
     assert lines[1] == "not found in the map: 1 frames, blank.png"
-    assert lines[-2].startswith("before: ")
-    assert lines[-1].startswith("after: ")
-    assert lines[-1].endswith("100.0 % accepted")
+    assert lines[-3].startswith("before: ")
+    assert lines[-2].startswith("after: ")
+    assert lines[-2].endswith("100.0 % accepted")
+    result = json.loads((out / "metrics.json").read_text())
+    assert lines[-1].startswith(f"den: median {result['metrics']['position_error_m']:.3f} m / ")
+    assert lines[-1].endswith(" ms a query")
+    assert result["map"]["sessions"] == {"balcony": 7}
+    assert result["map"]["settings"] == {"key_frames": 160, "most_bytes": 4 * 2**20}
+    assert result["map"]["core_seconds"] > 0
+    assert result["data"]["train_frames"] == 8
     assert (folder / "map.safetensors").read_bytes() == before
     assert SparseMap.load(out / "map.safetensors").sessions == {"balcony": 7}
     for name in ("coverage.png", "points.png"):
@@ -74,12 +82,21 @@ def test_pictures_are_added_measured_and_removed_again(folder, pictures, den, tm
         (["--remove", "attic", "--out", "{out}"], r"attic: was never added to the map of room\. What was added: noth"),
         (["--add", "{empty}", "--out", "{out}"], r"holds no picture"),
         (["--add", "{out}/no.mp4", "--out", "{out}"], r"no such file"),
+        (["--remove", "attic", "--out", "{out}", "--name", "attic"], r"--name: is of what --add adds\. Leave it out"),
+        (["--intrinsics", "100,100,80,60"], r"--intrinsics: is of what --add adds\. Leave it out"),
+        (["--add", "{pictures}", "--out", "{out}", "--width", "100"], r"is built already\. Leave out --width"),
+        (["--test", "{den}", "--points", "colmap"], r"is built already\. Leave out --points"),
+        (["--test", "{out}/no.yaml"], r"no\.yaml: cannot be read"),
+        (["--add", "{strange}", "--out", "{out}"], r"strange: the map finds none of 3 frames\. Check that they show"),
         (["--add", "{den}", "--out", "{out}", "--intrinsics", "100,100,80,60"], r"Leave out --intrinsics"),
     ],
 )
 def test_wrong_uses_are_refused_in_a_line(folder, pictures, den, tmp_path, argv, message, capsys):
-    (tmp_path / "empty").mkdir()
-    places = {"pictures": pictures, "den": den, "out": tmp_path / "out", "empty": tmp_path / "empty"}
+    for name in ("empty", "strange"):
+        (tmp_path / name).mkdir()
+    for row, noise in enumerate(np.random.default_rng(0).integers(0, 255, (3, 30, 40, 3), dtype=np.uint8)):
+        cv2.imwrite(str(tmp_path / "strange" / f"{row}.png"), noise.repeat(4, 0).repeat(4, 1))
+    places = {"pictures": pictures, "den": den, **{name: tmp_path / name for name in ("out", "empty", "strange")}}
     with pytest.raises(SystemExit) as exit_info:
         main(folder, *(each.format(**places) for each in argv))
     error = capsys.readouterr().err.strip()

@@ -121,7 +121,7 @@ def test_a_result_without_poses_is_written_as_json(den, tmp_path, monkeypatch):
     nowhere = MapErrors(np.full(8, np.inf), np.full(8, np.inf), *np.zeros((2, 8), bool), np.ones(8))
     monkeypatch.setattr(evaluating, "measure", lambda *_: nowhere)
     recipe = MapRecipe("den", root=str(den), settings=MapSettings(30, 160), ransac_seeds=(0,))
-    assert "worst inf m" in evaluating.describe(build_and_measure(recipe, tmp_path))
+    assert "worst inf m" in build_and_measure(recipe, tmp_path).describe()
     metrics = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)["metrics"]
     assert metrics["position_error_worst_m"] is None
     assert metrics["without_pose"] == 1
@@ -138,7 +138,7 @@ def blocks():
 def test_real_frames_are_localised_to_centimetres(blocks, tmp_path):
     """Redkitchen seq-01 blocks (800/200), 40 key frames at 160x120; measured: 0.041 m / 0.93 deg."""
     recipe = MapRecipe("redkitchen", root=blocks, settings=MapSettings(40, 160, 2**18), ransac_seeds=(0,))
-    metrics = build_and_measure(recipe, tmp_path)["metrics"]
+    metrics = build_and_measure(recipe, tmp_path).result["metrics"]
     assert metrics["position_error_m"] < 0.05
     assert metrics["rotation_error_deg"] < 2
     assert (tmp_path / "map.safetensors").stat().st_size <= 2**18

@@ -146,6 +146,29 @@ def test_differences_over_scenes_resample_each_by_itself(tmp_path):
     assert (overall.mean, overall.low, overall.high) == pytest.approx((-0.15, -0.15, -0.15))
 
 
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (None, r"redkitchen: a result has no errors of single frames"),
+        ([], r"redkitchen: a result has no errors of single frames"),
+        (
+            [f"seq-09/frame-{i:06d}.png" for i in range(FRAMES)],
+            r"--compare gis: none and gis were measured on different",
+        ),
+    ],
+)
+def test_results_of_other_frames_or_none_are_not_compared(tmp_path, frames, message):
+    told = {("a", gis, "0"): result("posenet", gis, [0.5] * FRAMES) for gis in ("none", "gis")}
+    if frames is None:
+        del told["a", "gis", "0"]["frames"]
+    else:
+        told["a", "gis", "0"]["frames"]["image"] = frames
+    folder = stored(tmp_path / "results", told)
+    with pytest.raises(InputError, match=message):
+        write_report(folder, tmp_path / "report", [("gis", "none", "gis")])
+    assert not (tmp_path / "report").exists()
+
+
 class Tables(HTMLParser):
     """Text of every table's cells."""
 

@@ -73,7 +73,7 @@ def test_it_is_built_from_the_frames_that_are_trained_on_and_no_others(den, tmp_
     assert built.scene == "den"
     assert built.digests["frames"] == data.chosen_training_frames().digest()
     said = capsys.readouterr().out
-    assert said.startswith(f"{tmp_path}/map/map.safetensors: {len(built)} points from 24 key frames, ")
+    assert said.startswith(f"{tmp_path}/map/map.safetensors: points triangulated: {len(built)}, in 24 key frames, ")
     assert said.count("\n") == 1
 
 

@@ -9,6 +9,7 @@ there; poses and projections are pycolmap's own.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, is_sound, load_colmap
+from mambaloc.data.tracks import Tracks
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
@@ -64,9 +66,29 @@ def read_colmap(source: Path) -> Capture:
         "model": path.relative_to(source).as_posix(),
     }
     beside = pictures_beside(each.image for each in posed)
-    return build_capture(
+    capture = build_capture(
         "colmap", source, posed, unit="unknown", choices=choices, cameras=cameras, missing=missing, beside=beside
     )
+    image_of = dict(zip(files, images, strict=True))
+    return replace(capture, tracks=_tracks(model, [image_of[file] for file in capture.images]))
+
+
+def _tracks(model: Any, images: list[Any]) -> Tracks | None:
+    """The model's points and where the images see them; ids without a point, as in a cut-off text, are left out."""
+    place_of = {number: point.xyz for number, point in model.points3D.items() if np.isfinite(point.xyz).all()}
+    row_of = {number: row for row, number in enumerate(sorted(place_of))}
+    points, frames, rays = [], [], []
+    for row, image in enumerate(images):
+        seen = [point for point in image.get_observation_points2D() if point.point3D_id in row_of]
+        pixels = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
+        ray = np.asarray(model.cameras[image.camera_id].cam_from_img(pixels), np.float64).reshape(-1, 2)
+        is_seen = np.isfinite(ray).all(axis=1)  # a lens may not see where a pixel looks
+        points.append(np.array([row_of[point.point3D_id] for point in seen], np.int64)[is_seen])
+        frames.append(np.full(is_seen.sum(), row, np.int64))
+        rays.append(ray[is_seen])
+    points_m = np.array([place_of[number] for number in row_of], np.float64).reshape(-1, 3)
+    tracks = Tracks(points_m, np.concatenate(points), np.concatenate(frames), np.concatenate(rays))
+    return tracks.of_frames(np.arange(len(images))) or None
 
 
 def _key(name: str) -> tuple[tuple[int, str, int, str], ...]:

@@ -87,6 +87,7 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
         time_s=None if capture.time_s is None else capture.time_s[np.array(rows, dtype=np.int64)],
         split=of(capture.split),
         depth=depth and replace(depth, files=tuple(depth.files[row] for row in rows)),
+        tracks=capture.tracks and capture.tracks.of_frames(np.array(rows, dtype=np.int64)),
     )
 
 

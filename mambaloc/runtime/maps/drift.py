@@ -33,12 +33,28 @@ def fit_drift(adjusted: Floats, given: Floats) -> NDArray[np.float64]:
     Returns:
         (K, 6): of shifts in metres and turns in radians, both along the camera's axes.
     """
+    return drift_weights(adjusted, drift_moves(adjusted, given))
+
+
+def drift_moves(adjusted: Floats, given: Floats) -> NDArray[np.float64]:
+    """Shifts and turns along the camera's axes, from adjusted to given ``world_from_cam`` (K, 4, 4); (K, 6)."""
     inverse = adjusted[:, :3, :3].transpose(0, 2, 1)
     shifts = (inverse @ (given[:, :3, 3] - adjusted[:, :3, 3])[..., None])[..., 0]
     turns = [cv2.Rodrigues(turn)[0][:, 0] for turn in inverse @ given[:, :3, :3]]
-    places = viewpoints(adjusted, spread_m(adjusted))
-    weights = np.linalg.solve(_kernel(places, places) + _NUGGET * np.eye(len(places)), np.hstack((shifts, turns)))
+    return np.hstack((shifts, turns))
+
+
+def drift_weights(adjusted: Floats, moves: Floats) -> NDArray[np.float64]:
+    """Weights of key frames of which some moves (K, 6) are known; the others, NaN, weigh nothing."""
+    known = np.flatnonzero(np.isfinite(moves[:, 0]))
+    weights = np.zeros_like(moves)
+    weights[known] = np.linalg.solve(_covariance(adjusted)[np.ix_(known, known)], moves[known])
     return np.asarray(weights, np.float64)
+
+
+def known_moves(adjusted: Floats, weights: Floats) -> NDArray[np.float64]:
+    """The inverse of :func:`drift_weights`, up to rounding."""
+    return np.asarray(np.where(weights.any(axis=1, keepdims=True), _covariance(adjusted) @ weights, np.nan))
 
 
 class Drift:
@@ -53,7 +69,7 @@ class Drift:
         self._unit_m = spread_m(key_poses)
         self._places = viewpoints(key_poses, self._unit_m)
         self._weights = weights
-        covariance = _kernel(self._places, self._places) + _NUGGET * np.eye(len(key_poses))
+        covariance = _covariance(key_poses)
         self._inverse = np.linalg.inv(covariance)
         self._amplitude = weights.T @ covariance @ weights / len(weights)  # most likely, (6, 6)
 
@@ -79,6 +95,12 @@ class Drift:
 
     def _near(self, pose: CameraPose) -> Floats:
         return _kernel(viewpoints(pose.matrix[None], self._unit_m), self._places)[0]
+
+
+def _covariance(key_poses: Floats) -> Floats:
+    """Of the moves of key frames, over the variance of the drift, (K, K)."""
+    places = viewpoints(key_poses, spread_m(key_poses))
+    return _kernel(places, places) + _NUGGET * np.eye(len(places))
 
 
 def _kernel(places: Floats, others: Floats) -> Floats:

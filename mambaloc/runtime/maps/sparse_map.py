@@ -20,7 +20,8 @@ from mambaloc.runtime.maps.acceptance import RULE
 from mambaloc.runtime.maps.features import check_intrinsics
 from mambaloc.runtime.maps.lens import Lens
 
-VERSION = 1
+VERSION = 2
+"""Of files whose drift has changed since the map was built; others are of version 1."""
 MAP_FILE = "map.safetensors"
 """What a map is called in the folders that tools write."""
 _MOST_POINTS = 10**7
@@ -49,10 +50,11 @@ class SparseMap:
         digests: of what the map was made from, by name.
         lens: how the camera differs from ``intrinsics``.
         drift: (K, 6), carries poses to the frame of the given ones, see
-            :func:`~mambaloc.runtime.maps.drift.fit_drift`; (0, 6) where that is the map's own. Key frames that were
-            added later have none.
+            :func:`~mambaloc.runtime.maps.drift.fit_drift`; (0, 6) where that is the map's own. Rows of 0 stand for
+            key frames that came without a pose.
         sessions: what was added later: how many key frames each has by its name, in the order of ``key_poses``, whose
             last they are.
+        first_drift: ``drift`` before any key frame was added; (0, 6) where it has not changed since.
     """
 
     points_m: NDArray[np.float32]
@@ -67,6 +69,7 @@ class SparseMap:
     lens: Lens = field(default_factory=Lens)
     drift: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     sessions: dict[str, int] = field(default_factory=dict)
+    first_drift: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -75,6 +78,11 @@ class SparseMap:
     def is_seen(self) -> NDArray[np.bool_]:
         """Which key frames (columns) see which points (rows), (P, K)."""
         return np.unpackbits(self.views, axis=1, count=len(self.key_poses)).view(bool)
+
+    @property
+    def has_grown_drift(self) -> bool:
+        """Whether key frames that were added changed the drift."""
+        return len(self.drift) > len(self.key_poses) - sum(self.sessions.values())
 
     def save(self, path: Path) -> None:
         """Write it to a safetensors file, whole or not at all.
@@ -96,8 +104,10 @@ class SparseMap:
             "lens": self.lens.numbers,
             "drift": self.drift,
         }
+        if self.has_grown_drift:
+            arrays["first_drift"] = self.first_drift
         about = {
-            "version": VERSION,
+            "version": VERSION if "first_drift" in arrays else 1,
             "scene": self.scene,
             "least_inliers": self.least_inliers,
             "rule": RULE,
@@ -125,7 +135,7 @@ class SparseMap:
             arrays = load(data)  # checks the header's length and offsets, so that the header can be read
             about = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["about"])
             if about["version"] <= VERSION:
-                return cls._checked(about, {name: arrays[name] for name in _ARRAYS})
+                return cls._checked(about, {"first_drift": np.zeros((0, 6)), **arrays})
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error}). tools/map.py writes maps.") from None
         except (*_DAMAGE, InputError) as error:
@@ -142,7 +152,7 @@ class SparseMap:
             fits = len(given.shape) == len(shape) and all(b in (0, a) for a, b in zip(given.shape, shape, strict=True))
             if given.dtype != dtype or not fits:
                 raise ValueError(f"{name} is {given.dtype} {given.shape}")
-        if about["crc32"] != _crc32(arrays):
+        if about["crc32"] != _crc32({name: arrays[name] for name in _ARRAYS}):
             raise ValueError("its checksum differs")
         points, key_poses, (width, height) = arrays["points_m"], arrays["key_poses"], map(int, arrays["size"])
         counts = {len(points), len(arrays["descriptors"]), len(arrays["views"])}
@@ -153,9 +163,10 @@ class SparseMap:
         sessions = {str(name): int(count) for name, count in dict(about.get("sessions", {})).items()}
         if any(count < 1 for count in sessions.values()) or sum(sessions.values()) >= len(key_poses):
             raise ValueError(f"sessions of {sum(sessions.values())} of {len(key_poses)} key frames")
-        if len(arrays["drift"]) not in (0, len(key_poses) - sum(sessions.values())):
-            raise ValueError(f"drift of {len(arrays['drift'])} key frames of {len(key_poses)}")
-        if not all(np.isfinite(arrays[name]).all() for name in ("points_m", "key_poses", "lens", "drift")):
+        first, drift = len(key_poses) - sum(sessions.values()), len(arrays["drift"])
+        if (drift and not first <= drift <= len(key_poses)) or len(arrays["first_drift"]) not in (0, first):
+            raise ValueError(f"drift of {drift} key frames of {len(key_poses)}")
+        if not all(np.isfinite(arrays[name]).all() for name in _ARRAYS if _ARRAYS[name][0] != np.uint8):
             raise ValueError("numbers are not finite")
         if not 0 < width <= LARGEST_SIDE_PX or not 0 < height <= LARGEST_SIDE_PX:
             raise ValueError(f"pictures of {width}x{height}")
@@ -164,7 +175,7 @@ class SparseMap:
             points, arrays["descriptors"], arrays["views"], key_poses, (width, height), arrays["intrinsics"],
             int(about["least_inliers"]), str(about["scene"]),
             {str(name): str(digest) for name, digest in dict(about["digests"]).items()},
-            Lens(*map(float, arrays["lens"])), arrays["drift"], sessions,
+            Lens(*map(float, arrays["lens"])), arrays["drift"], sessions, arrays["first_drift"],
         )  # fmt: skip
 
 
@@ -177,6 +188,7 @@ _ARRAYS = {  # a side of 0 may have any length
     "intrinsics": (np.float64, (3, 3)),
     "lens": (np.float64, (2,)),
     "drift": (np.float64, (0, 6)),
+    "first_drift": (np.float64, (0, 6)),
 }
 
 

@@ -32,6 +32,24 @@ def test_a_model_is_read_back(recording, tmp_path, binary, model, images):
     assert (camera.width, camera.height, camera.focal_px, camera.centre_px) == (*SIZE, (60, 60), (32.5, 24.5))
 
 
+def test_points_are_read_with_their_tracks(recording, tmp_path):
+    """The point of the model, seen by its first two images at pixel (3, 4) from the corner, against OpenCV."""
+    write_model(recording, tmp_path, models=("OPENCV",))
+    recording.write(tmp_path, NAMES)
+    tracks = read_capture(tmp_path).tracks
+    fx, fy, cx, cy, *lens = MODELS["OPENCV"]
+    ray = cv2.undistortPoints(np.array([[[3.0, 4.0]]]), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(lens))
+    assert tracks.points_m.tolist() == [[1, 2, 3]]
+    assert (tracks.point.tolist(), tracks.frame.tolist()) == ([0, 0], [3, 4])  # run before walk
+    np.testing.assert_allclose(tracks.rays, [ray[0, 0]] * 2, atol=1e-3)
+
+
+def test_a_model_without_points_has_no_tracks(recording, tmp_path):
+    write_model(recording, tmp_path, points=False)
+    recording.write(tmp_path, NAMES)
+    assert read_capture(tmp_path).tracks is None
+
+
 @pytest.mark.parametrize("model", ["sparse/0", "sparse"])
 def test_images_are_found_from_the_models_own_folder(recording, tmp_path, model):
     write_model(recording, tmp_path / model)
