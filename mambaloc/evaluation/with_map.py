@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,17 +13,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mambaloc.console import progress
 from mambaloc.data import Frames, PoseDataModule
 from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.files import sha256
-from mambaloc.images import read_image
-from mambaloc.mapping.evaluating import MapErrors, covers
+from mambaloc.mapping.evaluating import MapErrors, covers, localise_frames
 from mambaloc.metrics import PoseErrorTable
 from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
-from mambaloc.runtime.rotations import matrix_from_quaternion
+from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
 
 RUN_MAP = Path("map", MAP_FILE)
 """Where a run keeps its map."""
@@ -53,8 +50,7 @@ class Answers:
     @classmethod
     def of(cls, found: Sequence[MapLocalisation | Localisation], frames: Frames, cpu_s: Floats) -> Self:
         """Compare answers with the frames' true poses."""
-        truths = np.tile(np.eye(4), (len(frames), 1, 1))
-        truths[:, :3, :3], truths[:, :3, 3] = matrix_from_quaternion(frames.quaternion), frames.position_m
+        truths = rigid_transforms(matrix_from_quaternion(frames.quaternion), frames.position_m)
         pairs = zip(found, truths, strict=True)
         covered = [covers(it.position_m, it.quaternion, it.covariance, truth) for it, truth in pairs]
         sources = ["map" if isinstance(it, MapLocalisation) else str(it.source) for it in found]
@@ -94,7 +90,7 @@ class MeasuredMap:
         poses = (network.predicted_position_m.cpu().numpy(), network.predicted_quaternion.cpu().numpy())
         said = [Localisation(position_m, quaternion, 0.0) for position_m, quaternion in zip(*poses, strict=True)]
         priors = [CameraPose.from_quaternion(each.quaternion, each.position_m) for each in said]
-        found, cpu_s = _localise(self.localiser, self.frames, self.intrinsics, priors)
+        found, cpu_s = localise_frames(self.localiser, self.frames.image_paths, self.intrinsics, priors)
         answers = [combined(*both) for both in zip(said, found, strict=True)]
         return Answers.of(answers, self.frames, cpu_s)
 
@@ -126,7 +122,7 @@ def measure_map(path: Path, data: PoseDataModule) -> MeasuredMap:
     data.setup("test")
     frames, localiser = data.frames("test"), MapLocaliser(SparseMap.load(path))
     intrinsics = frame_intrinsics(data.hparams["dataset"], data.folder, frames)
-    found, cpu_s = _localise(localiser, frames, intrinsics, [None] * len(frames))
+    found, cpu_s = localise_frames(localiser, frames.image_paths, intrinsics)
     return MeasuredMap(path, localiser, frames, intrinsics, Answers.of(found, frames, cpu_s))
 
 
@@ -145,18 +141,6 @@ def measure_map_of_run(run: Path, data: PoseDataModule) -> MeasuredMap | None:
     except InputError as error:
         warnings.warn(f"{error} The network is measured without the map.", InputWarning, stacklevel=2)
         return None
-
-
-def _localise(
-    localiser: MapLocaliser, frames: Frames, intrinsics: Floats, priors: Sequence[CameraPose | None]
-) -> tuple[list[MapLocalisation], Floats]:
-    found, cpu_s = [], []
-    rows = zip(frames.image_paths, intrinsics, priors, strict=True)
-    for path, matrix, prior in progress(rows, "in the map", len(frames)):
-        rgb, start = read_image(path), time.process_time()
-        found.append(localiser.localise(rgb, matrix, prior))
-        cpu_s.append(time.process_time() - start)
-    return found, np.array(cpu_s)
 
 
 def _table(answers: Sequence[MapLocalisation | Localisation], frames: Frames) -> PoseErrorTable:

@@ -30,7 +30,12 @@ from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.metrics import summarise_errors
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
 from mambaloc.runtime.maps.radii import LEVEL
-from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix, rotation_error_deg
+from mambaloc.runtime.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rigid_transforms,
+    rotation_error_deg,
+)
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +106,8 @@ def with_cameras(dataset: str, folder: Path, frames: Frames) -> PosedFrames:
     Raises:
         InputError: where cameras are unknown, or the points' file is damaged.
     """
-    intrinsics, poses = frame_intrinsics(dataset, folder, frames), _world_from_cam(frames)
+    intrinsics = frame_intrinsics(dataset, folder, frames)
+    poses = rigid_transforms(matrix_from_quaternion(frames.quaternion), frames.position_m)
     return PosedFrames(frames.image_paths, intrinsics, poses, _tracks(folder, frames) if is_captured(folder) else None)
 
 
@@ -287,9 +293,3 @@ def _tracks(folder: Path, frames: Frames) -> Tracks | None:
     row_of = {row.image: number for number, row in enumerate(read_rows(folder))}
     tracks = read_tracks(folder, len(row_of))
     return tracks and tracks.of_frames(np.array([row_of[image] for image in frames.image_paths]))
-
-
-def _world_from_cam(frames: Frames) -> Floats:
-    poses = np.tile(np.eye(4), (len(frames), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = matrix_from_quaternion(frames.quaternion), frames.position_m
-    return poses

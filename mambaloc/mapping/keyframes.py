@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mambaloc.runtime.maps.viewpoints import spread_m, viewpoints
+from mambaloc.runtime.maps.viewpoints import farthest_points, spread_m, viewpoints
 
 
 def farthest_first(world_from_cam: ArrayLike, count: int) -> NDArray[np.int64]:
@@ -21,10 +21,5 @@ def farthest_first(world_from_cam: ArrayLike, count: int) -> NDArray[np.int64]:
         Rows in ascending order, (min(count, N),).
     """
     places = viewpoints(world_from_cam, spread_m(world_from_cam))
-    chosen = [int(((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin())]
-    nearest = np.full(len(places), np.inf)
-    while len(chosen) < min(count, len(places)):
-        nearest = np.minimum(nearest, ((places - places[chosen[-1]]) ** 2).sum(axis=1))
-        nearest[chosen] = -1
-        chosen.append(int(nearest.argmax()))
-    return np.sort(np.array(chosen, np.int64))
+    middle = ((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin()
+    return farthest_points(places, count, int(middle))

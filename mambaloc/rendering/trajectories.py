@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mambaloc.rendering.quads import Vectors
+from mambaloc.runtime.rotations import rigid_transforms
 
 _KNOT_DEG = 30.0  # how far the view turns between two way points
 
@@ -62,10 +63,7 @@ def looking(position_m: ArrayLike, azimuth_rad: ArrayLike, pitch_rad: ArrayLike,
     level_down = np.cross(forward, level_right)
     cos_r, sin_r = np.cos(r)[:, None], np.sin(r)[:, None]
     right = cos_r * level_right + sin_r * level_down
-    world_from_cam = np.tile(np.eye(4), (len(a), 1, 1))
-    world_from_cam[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
-    world_from_cam[:, :3, 3] = position_m
-    return world_from_cam
+    return rigid_transforms(np.stack([right, np.cross(forward, right), forward], axis=-1), position_m)
 
 
 def _spline_noise(rng: np.random.Generator, knots: Vectors, channels: int) -> Vectors:

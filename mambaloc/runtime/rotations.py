@@ -118,6 +118,17 @@ def rotation_error_deg(a: ArrayLike, b: ArrayLike) -> Floats:
     return np.degrees(4 * np.arctan2(np.minimum(*chords), np.maximum(*chords)))
 
 
+def rigid_transforms(rotation: ArrayLike, position: ArrayLike) -> Floats:
+    """Homogeneous matrices.
+
+    Shape:
+        (N, 3, 3), (N, 3) -> (N, 4, 4).
+    """
+    matrices = np.tile(np.eye(4), (len(np.asarray(position)), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = rotation, position
+    return matrices
+
+
 def is_rotation(matrix: ArrayLike, tolerance: float = 1e-3) -> NDArray[Any]:
     """Whether matrices are finite, orthonormal and right-handed; (..., 3, 3) -> (...), bool.
 

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.runtime.maps.viewpoints import farthest_points
 from mambaloc.synthesis.consistency import confirmed
 from mambaloc.synthesis.plane_sweep import PlaneSweep, SweepSettings
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
@@ -101,9 +102,4 @@ def range_from_pictures(
 def spread_rows(world_from_cam: Floats, scale_m: float, count: int) -> NDArray[np.int64]:
     """Frames that are spread over the poses: each the farthest from those before it, in order of their rows."""
     place = np.hstack((world_from_cam[:, :3, 3] / scale_m, world_from_cam[:, :3, 2]))
-    chosen = [0]
-    apart = np.linalg.norm(place - place[0], axis=1)
-    while len(chosen) < min(count, len(place)):
-        chosen.append(int(apart.argmax()))
-        apart = np.minimum(apart, np.linalg.norm(place - place[chosen[-1]], axis=1))
-    return np.sort(chosen)
+    return farthest_points(place, count, first=0)

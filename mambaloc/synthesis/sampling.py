@@ -11,6 +11,7 @@ from mambaloc.runtime.rotations import (
     multiply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
+    rigid_transforms,
     rotation_vector_between,
 )
 from mambaloc.synthesis.posed_depth import Floats
@@ -69,8 +70,6 @@ class PoseSampler:
         )
         noise_rad = np.radians(self.spread.noise_deg) * rng.standard_normal((count, 3))
         quaternion = multiply(multiply(self.quaternion[first], turn), quaternion_from_rotation_vector(noise_rad))
-        world_from_cam = np.tile(np.eye(4), (count, 1, 1))
-        world_from_cam[:, :3, :3] = matrix_from_quaternion(quaternion)
-        world_from_cam[:, :3, 3] = (1 - way) * self.position_m[first] + way * self.position_m[second]
-        world_from_cam[:, :3, 3] += self.spread.noise * self.scale_m * rng.standard_normal((count, 3))
-        return world_from_cam
+        position_m = (1 - way) * self.position_m[first] + way * self.position_m[second]
+        position_m += self.spread.noise * self.scale_m * rng.standard_normal((count, 3))
+        return rigid_transforms(matrix_from_quaternion(quaternion), position_m)

@@ -15,7 +15,7 @@ from mambaloc.data.frames import ROTATION_TOLERANCE, UNIT_TOLERANCE
 from mambaloc.errors import InputError
 from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture, Depth, Unit
-from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quaternion_from_matrix
+from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quaternion_from_matrix, rigid_transforms
 
 Matrices = NDArray[np.float64]
 
@@ -167,9 +167,7 @@ def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[floa
 def _transforms(rotation: Matrices, position: Matrices, where: Callable[[int], str]) -> Matrices:
     """Homogeneous matrices of rotations (N, 3, 3) and positions (N, 3), which must not be too far away."""
     _refuse(np.abs(position).max(axis=1, initial=0) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
-    matrices = np.tile(np.eye(4), (len(position), 1, 1))
-    matrices[:, :3, :3], matrices[:, :3, 3] = rotation, position
-    return matrices
+    return rigid_transforms(rotation, position)
 
 
 def _refuse(is_bad: Any, where: Callable[[int], str], rule: str) -> None:

@@ -80,7 +80,7 @@ def refine_pose(start: CameraPose, points_m: Floats, rays: Floats, near: float) 
         The pose, and its covariance (6, 6): of the position in metres, then of the rotation in radians about the fixed
         axes of the world (``R = exp(θ) R_estimated``), as ROS's PoseWithCovariance has it; all infinite where a point
         lies behind the camera. It is the sandwich of an M-estimator, ``H^-1 (Σ g g^T) H^-1`` of the cost's Hessian and
-        each match's gradient (Huber 1967): Cauchy's weights are no variances, so the inverse of the normal equations
+        each match's gradient (Huber 1967): Cauchy's weights are not variances, so the inverse of the normal equations
         is too small where residuals are as large as their scale.
     """
     pose, damping = start, 1e-4

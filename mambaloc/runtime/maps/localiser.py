@@ -159,14 +159,7 @@ class MapLocaliser:
             off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
             scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
         is_inlier = off <= near
-        is_distinctive = matches.is_distinctive
-        pixels = features.pixels[matches.keypoints[is_distinctive & is_inlier]]
-        deviation = np.inf
-        if is_distinctive.sum() >= 4:
-            _, of_distinctive = refine_pose(pose, seen_m[is_distinctive], rays[is_distinctive], finest)
-            deviation = _deviation_m(of_distinctive) / self._unit_m
-        turn_deg = np.degrees(np.linalg.norm(cv2.Rodrigues(start.rotation.T @ pose.rotation)[0]))
-        evidence = Evidence(occupied_cells(pixels, features.size), deviation, float(turn_deg))
+        evidence = self._evidence(features, matches, is_inlier, start, pose, finest)
         focal = focal_scale(pose, seen_m, rays, finest)
         focal_off = focal[0] if is_another_focal_length(*focal) else None
         probability = evidence.probability if focal_off is None else 0.0
@@ -181,6 +174,25 @@ class MapLocaliser:
             focal_off,
             evidence,
         )
+
+    def _evidence(
+        self,
+        features: Features,
+        matches: _Matches,
+        is_inlier: NDArray[np.bool_],
+        start: CameraPose,
+        pose: CameraPose,
+        scale: float,
+    ) -> Evidence:
+        """What distinctive matches say of a pose that :meth:`_settled` refined from ``start``, at a ``scale``."""
+        points, keypoints = matches.points[matches.is_distinctive], matches.keypoints[matches.is_distinctive]
+        deviation = np.inf
+        if len(points) >= 4:
+            _, covariance = refine_pose(pose, self._points_m[points], features.rays[keypoints], scale)
+            deviation = _deviation_m(covariance) / self._unit_m
+        pixels = features.pixels[matches.keypoints[matches.is_distinctive & is_inlier]]
+        turn_deg = np.degrees(np.linalg.norm(cv2.Rodrigues(start.rotation.T @ pose.rotation)[0]))
+        return Evidence(occupied_cells(pixels, features.size), deviation, float(turn_deg))
 
     def matches(self, features: Features, pose: CameraPose) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Points that a picture shows where its pose projects them: rows of keypoints and of points."""

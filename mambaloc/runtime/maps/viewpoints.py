@@ -16,6 +16,25 @@ def spread_m(world_from_cam: ArrayLike) -> float:
     return float(np.sqrt(((position_m - position_m.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
+def farthest_points(places: Floats, count: int, first: int) -> NDArray[np.int64]:
+    """Spread a choice over points: each is the farthest from those before it.
+
+    Args:
+        places: (N, D).
+        count: so many at most.
+        first: the row to begin with.
+
+    Returns:
+        Rows in ascending order, (min(count, N),), none twice.
+    """
+    chosen, nearest = [first], np.full(len(places), np.inf)
+    while len(chosen) < min(count, len(places)):
+        nearest = np.minimum(nearest, ((places - places[chosen[-1]]) ** 2).sum(axis=1))
+        nearest[chosen] = -1
+        chosen.append(int(nearest.argmax()))
+    return np.sort(np.array(chosen, np.int64))
+
+
 def viewpoints(world_from_cam: ArrayLike, unit_m: float) -> Floats:
     """Cameras as points whose distance counts a move by the unit as much as a turn by 25 degrees.
 
