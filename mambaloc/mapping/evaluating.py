@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from mambaloc import provenance
 from mambaloc.console import progress
@@ -35,6 +34,7 @@ from mambaloc.runtime.rotations import (
     quaternion_from_matrix,
     rigid_transforms,
     rotation_error_deg,
+    rotation_vector_from_quaternion,
 )
 
 Floats = NDArray[np.float64]
@@ -160,11 +160,10 @@ def covers(position_m: ArrayLike, quaternion: ArrayLike, covariance: ArrayLike |
     """Whether a true pose, (4, 4), is inside the 90 % ellipsoid of an answer's covariance; False without one."""
     if covariance is None or not np.isfinite(covariance).all():
         return False
-    turn = Rotation.from_matrix(truth[:3, :3] @ matrix_from_quaternion(quaternion).T).as_rotvec()
-    off = np.concatenate((truth[:3, 3] - np.asarray(position_m), turn))
-    return bool(
-        off @ np.linalg.pinv(np.asarray(covariance, np.float64), hermitian=True) @ off <= chi2.ppf(LEVEL, len(off))
-    )
+    turn = quaternion_from_matrix(truth[:3, :3] @ matrix_from_quaternion(quaternion).T)
+    off = np.concatenate((truth[:3, 3] - np.asarray(position_m), rotation_vector_from_quaternion(turn)))
+    inverse = np.linalg.pinv(np.asarray(covariance, np.float64), hermitian=True)
+    return bool(off @ inverse @ off <= chdtri(len(off), 1 - LEVEL))  # chi-squared's quantile
 
 
 @dataclass(frozen=True)
