@@ -81,13 +81,13 @@ def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_
 def _key(paths: Sequence[Path], short_side: int) -> str:
     digest = hashlib.sha256(f"{_VERSION} {short_side}".encode())
     with ThreadPoolExecutor() as pool:
-        for path, content in zip(paths, pool.map(_fingerprint, paths), strict=True):
+        for path, content in zip(paths, pool.map(fingerprint, paths), strict=True):
             digest.update(f"{path.parent.name}/{path.name}\0".encode())
             digest.update(content)
     return digest.hexdigest()[:32]
 
 
-def _fingerprint(path: Path) -> bytes:
+def fingerprint(path: Path) -> bytes:
     """Size, first and last bytes: a PNG's end holds its checksum, so any change of its pixels shows there."""
     try:
         with path.open("rb") as file:

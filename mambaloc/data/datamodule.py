@@ -18,6 +18,7 @@ from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.frames import Frames, OnBadFrame, Split
 from mambaloc.data.scene import Scene
 from mambaloc.data.splits import Validation
+from mambaloc.data.views import FramesAndViews, MixedSampler, ViewDepth
 from mambaloc.errors import InputError
 from mambaloc.geometry import cropped_intrinsics
 from mambaloc.types import PoseBatch
@@ -55,7 +56,13 @@ class PoseDataModule(L.LightningDataModule):
         clip_length: train on clips of so many frames of a sequence, as MapNet does.
         clip_skip: frames from one of a clip to the next, counted before thinning.
         points_per_frame: scene points that training and validation frames carry, from depth frames,
-            ``reconstruction.nvm`` or a COLMAP model in the scene's folder; 0 reads none.
+            ``reconstruction.nvm`` or a COLMAP model in the scene's folder; 0 reads none. Where there are views, they
+            come from the depth that these are made from.
+        views: how many synthetic views to train on beside the frames; 0 makes none.
+        view_depth: what they are made from. ``sensor``: depth frames of training frames; ``pictures``: depth that a
+            plane sweep finds in them; ``auto``: the sensor's where enough training frames have some.
+        view_share: share of views in each training batch; three in four, or none where views of held-out training
+            frames do not match these, unless given. An epoch is a pass over the frames.
         on_bad_frame: ``error`` stops at a bad frame; ``skip`` leaves it out and counts it.
         cache_dir: where decoded frames are kept; ``$MAMBALOC_CACHE`` or the user's cache folder unless given.
     """
@@ -86,6 +93,9 @@ class PoseDataModule(L.LightningDataModule):
         clip_length: int = 1,
         clip_skip: int = 10,
         points_per_frame: int = 0,
+        views: int = 0,
+        view_depth: ViewDepth = "auto",
+        view_share: float | None = None,
         on_bad_frame: OnBadFrame = "error",
         cache_dir: str | None = None,
     ) -> None:
@@ -97,10 +107,10 @@ class PoseDataModule(L.LightningDataModule):
         self.crop = self.scene.crop
         self.jitter = Jitter(brightness, contrast, saturation)
         rotation = RandomRotation(self.crop, rotation_deg, zoom)
-        views: dict[str, RandomCrop | RandomRotation] = {"crop": RandomCrop(self.crop), "rotation": rotation}
-        if augmentation not in views:
-            raise InputError(f"data.augmentation {augmentation!r}: choose one of {', '.join(views)}")
-        self.augmentation = views[augmentation]
+        ways: dict[str, RandomCrop | RandomRotation] = {"crop": RandomCrop(self.crop), "rotation": rotation}
+        if augmentation not in ways:
+            raise InputError(f"data.augmentation {augmentation!r}: choose one of {', '.join(ways)}")
+        self.augmentation = ways[augmentation]
         self._resident: dict[Split, CachedFrames] = {}
         self._uniforms: tuple[tuple[int, int, torch.device], Tensor] | None = None
 
@@ -153,11 +163,14 @@ class PoseDataModule(L.LightningDataModule):
         return self.scene.describe()
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
-        """Shuffled training batches."""
+        """Shuffled training batches; the first call makes views."""
+        self.scene.add_views(self._device)
         return self._loader("train", self.hparams["batch_size"], shuffle=True)
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
         """Validation batches in order; none under ``validation: none``."""
+        if self.hparams["points_per_frame"]:
+            self.scene.add_views(self._device)
         return self._loader("val", self.hparams["eval_batch_size"]) if "val" in self.scene.parts else []
 
     def test_dataloader(self) -> DataLoader[PoseBatch]:
@@ -198,22 +211,21 @@ class PoseDataModule(L.LightningDataModule):
         """An epoch's chances of every training frame, drawn and sent to the device once."""
         drawn_for = (provenance.seed(), epoch, device)
         if self._uniforms is None or self._uniforms[0] != drawn_for:
-            frames, draws = len(self.scene.parts["train"].data.frames), self.augmentation.draws + self.jitter.draws
-            uniforms = draw_uniforms(provenance.seed(), epoch, frames, draws)
+            rows, draws = len(self.scene.items("train").position_m), self.augmentation.draws + self.jitter.draws
+            uniforms = draw_uniforms(provenance.seed(), epoch, rows, draws)
             self._uniforms = (drawn_for, uniforms.to(device))
         return self._uniforms[1]
 
     def _loader(self, part: Split, batch_size: int, shuffle: bool = False) -> DataLoader[PoseBatch]:
         data, trainer = self._data(part), self.trainer
         workers = 0 if data.resident is not None else self.hparams["num_workers"]
-        # One sampler everywhere: Lightning gives it the epoch, so order depends on (seed, epoch) alone.
-        sampler: DistributedSampler[PoseBatch] = DistributedSampler(
-            data,
-            num_replicas=trainer.world_size if trainer else 1,
-            rank=trainer.global_rank if trainer else 0,
-            shuffle=shuffle,
-            seed=provenance.seed(),
-        )
+        # One kind of sampler everywhere: Lightning gives it the epoch, so order depends on (seed, epoch) alone.
+        sampler: DistributedSampler[Any]
+        replicas, rank = (trainer.world_size, trainer.global_rank) if trainer else (1, 0)
+        if isinstance(data, FramesAndViews):
+            sampler = MixedSampler(data, batch_size, replicas, rank, provenance.seed())
+        else:
+            sampler = DistributedSampler(data, replicas, rank, shuffle, provenance.seed())
         if trainer and shuffle:
             # A resumed fit fetches its first batch before Lightning tells the sampler which epoch it is.
             sampler.set_epoch(trainer.fit_loop.epoch_progress.current.processed)  # type: ignore[attr-defined]
@@ -227,17 +239,18 @@ class PoseDataModule(L.LightningDataModule):
             persistent_workers=workers > 0,
         )
 
+    @property
+    def _device(self) -> torch.device:
+        return self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+
     def _data(self, part: Split) -> CachedFrames:
         """A part's frames, in the device's memory if they are to be there."""
-        data, resident = self.scene.parts[part].data, self._resident.get(part)
-        device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        data, resident, device = self.scene.items(part), self._resident.get(part), self._device
         if resident is not None and resident.position_m.device == device:
             return resident
         wanted = self.hparams["resident"]
         if wanted is None:
-            needed = sum(
-                loaded.data.images.nbytes for name, loaded in self.scene.parts.items() if name not in self._resident
-            )
+            needed = sum(self.scene.items(each).nbytes for each in self.scene.parts if each not in self._resident)
             wanted = device.type == "cuda" and 2 * needed <= torch.cuda.mem_get_info(device)[0]
         if not wanted:
             return data

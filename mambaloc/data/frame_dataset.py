@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,10 +56,19 @@ class CachedFrames(Dataset[PoseBatch]):
     def __len__(self) -> int:
         return len(self.clips)
 
+    @property
+    def nbytes(self) -> int:
+        """Of all pictures."""
+        return self.images.nbytes
+
+    def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Decoded pictures of some rows, (B, 3, H, W)."""
+        return np.stack([self.images[row] for row in rows])
+
     def to(self, device: torch.device) -> CachedFrames:
         """Return the same frames, whole in a device's memory: batches are made there, and nothing is copied to it."""
         there = copy(self)
-        there.resident = torch.from_numpy(np.array(self.images)).to(device)
+        there.resident = torch.from_numpy(self.pictures(range(len(self.position_m)))).to(device)
         for name in ("position_m", "quaternion", "points_m", "intrinsics"):
             if (values := getattr(self, name)) is not None:
                 setattr(there, name, values.to(device))
@@ -70,9 +79,7 @@ class CachedFrames(Dataset[PoseBatch]):
         rows = self.clips[items].ravel()
         index = torch.from_numpy(rows).to(self.position_m.device, non_blocking=True)
         return PoseBatch(
-            torch.from_numpy(np.stack([self.images[row] for row in rows]))
-            if self.resident is None
-            else self.resident[index],
+            torch.from_numpy(self.pictures(rows)) if self.resident is None else self.resident[index],
             self.position_m[index],
             self.quaternion[index],
             index,

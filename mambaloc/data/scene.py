@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from mambaloc import provenance
 from mambaloc.data.cameras import known_or_assumed_cameras
@@ -15,7 +18,18 @@ from mambaloc.data.frame_dataset import CachedFrames, LoadedSplit, describe_poin
 from mambaloc.data.frames import BadFrames, Frames, OnBadFrame, Split
 from mambaloc.data.points import read_points
 from mambaloc.data.splits import Validation, clips_of, hold_out, subsample
-from mambaloc.errors import InputError
+from mambaloc.data.views import (
+    FramesAndViews,
+    SceneViews,
+    ViewDepth,
+    ViewRequest,
+    make_scene_views,
+    points_of_frames_by_depth,
+    points_of_views,
+    poses_of,
+)
+from mambaloc.errors import InputError, InputWarning
+from mambaloc.synthesis import Splatter
 from mambaloc.types import height_and_width
 
 Read = tuple[Frames, BadFrames]
@@ -32,6 +46,7 @@ class Scene:
     Attributes:
         crop: height and width that networks see, in pixels.
         parts: what is loaded so far.
+        made_views: of the training frames, once :meth:`add_views` has made them.
 
     Raises:
         InputError: for a number that is out of range.
@@ -51,6 +66,9 @@ class Scene:
     clip_length: int
     clip_skip: int
     points_per_frame: int
+    views: int
+    view_depth: ViewDepth
+    view_share: float | None
     on_bad_frame: OnBadFrame
     cache_dir: str | None
 
@@ -58,6 +76,10 @@ class Scene:
         self.dataset, self.root, self.scene = locate(self.dataset, self.root, self.scene)
         self.crop = height_and_width(self.image_size)
         self.parts: dict[Split, LoadedSplit] = {}
+        self.made_views: SceneViews | None = None
+        self._mixed: FramesAndViews | None = None
+        self._is_viewed = False
+        ViewRequest(self.views, self.view_depth, self.view_share, 0)  # raises what is out of range
         self._listed: dict[str, int] = {}
         if min(self.crop) > self.short_side:
             raise InputError(
@@ -65,6 +87,11 @@ class Scene:
             )
         if self.points_per_frame < 0:
             raise InputError(f"data.points_per_frame {self.points_per_frame}: must be 0 or more; 0 reads none")
+        if self.views and self.clip_length > 1:
+            raise InputError(
+                f"data.clip_length {self.clip_length}: data.views are single pictures, of no sequence. Set one of the "
+                "two off."
+            )
 
     @property
     def folder(self) -> Path:
@@ -130,6 +157,54 @@ class Scene:
         if "test" not in self.parts:
             self.parts["test"] = self._decode(*self.read("test"))
 
+    def add_views(self, device: torch.device) -> None:
+        """Make views of the training frames, unless there are; points of frames come from the same depth.
+
+        Where there is no depth to make them from, or they are not worth training on, a line says so.
+
+        Args:
+            device: that makes them.
+
+        Raises:
+            InputError: where the depth that was asked for cannot be used.
+        """
+        if self.views == 0 or self._is_viewed:
+            return
+        self._is_viewed = True
+        self.made_views = made = self._made_views(device)
+        if made is None or made.views is None:
+            self.parts.update({part: self._with_points(each) for part, each in self.parts.items() if part != "test"})
+            return
+        count, seed = self.points_per_frame, provenance.seed()
+        if count:
+            splatter = Splatter(made.source, device)
+            for part in ("train", "val"):
+                if loaded := self.parts.get(part):
+                    data = loaded.data
+                    points = points_of_frames_by_depth(splatter, data, poses_of(data.frames), count, seed)
+                    seeing = CachedFrames(data.frames, data.images, data.cameras, points)
+                    self.parts[part] = replace(loaded, data=seeing)
+        of_views = points_of_views(made.views, count, seed) if count else None
+        self._mixed = FramesAndViews(self.parts["train"].data, made.views, made.share, of_views)
+
+    def items(self, part: Split) -> CachedFrames:
+        """What batches of a part are made of: its frames, and views beside those that are trained on."""
+        return self._mixed if part == "train" and self._mixed else self.parts[part].data
+
+    def _made_views(self, device: torch.device) -> SceneViews | None:
+        request = ViewRequest(self.views, self.view_depth, self.view_share, provenance.seed())
+        try:
+            made = make_scene_views(self.folder, self.parts["train"], request, self.cache_dir, device)
+        except InputError as error:
+            if self.view_depth != "auto":
+                raise
+            warnings.warn(f"{error} The training goes on without views.", InputWarning, stacklevel=2)
+            return None
+        if made.share == 0 and self.view_share is None:
+            line = f"{self.folder}: {made.quality.describe()}. The training goes on without views."
+            warnings.warn(line, InputWarning, stacklevel=2)
+        return made
+
     def describe(self) -> dict[str, Any]:
         """Say which frames a number comes from: scene, counts, selection rule, what was left out and repaired."""
         rendered = is_rendered(self.folder)
@@ -152,6 +227,7 @@ class Scene:
             "short_side": self.short_side,
             "cameras": {part: loaded.data.cameras.describe() for part, loaded in self.parts.items()},
             **describe_points(self.parts),
+            **({"views": self.made_views.describe()} if self.made_views else {}),
             **(describe_capture(self.folder) if self.dataset == CAPTURE else {}),
         }
 
@@ -171,7 +247,7 @@ class Scene:
 
     def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
         """Add what each frame may see, of the frames that could be decoded."""
-        if self.points_per_frame == 0:
+        if self.points_per_frame == 0 or (self.views and not self._is_viewed):  # views say where from
             return loaded
         data = loaded.data
         points = read_points(self.folder, data.frames, data.cameras, self.points_per_frame, provenance.seed())

@@ -1,0 +1,98 @@
+"""Batches of training frames and views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DistributedSampler
+
+from mambaloc.data.frame_dataset import CachedFrames
+from mambaloc.data.points import ScenePoints
+from mambaloc.errors import InputError
+from mambaloc.runtime.rotations import quaternion_from_matrix
+from mambaloc.synthesis import Views
+
+
+class FramesAndViews(CachedFrames):
+    """Training frames and, in the rows after them, views of the same size.
+
+    Args:
+        real: the frames, each an item of its own.
+        views: V of them.
+        share: of views in a batch, more than 0 and less than 1.
+        points: what each view shows, if the frames carry points.
+    """
+
+    def __init__(self, real: CachedFrames, views: Views, share: float, points: ScenePoints | None = None) -> None:
+        super().__init__(real.frames, real.images, real.cameras, real.points)
+        self.views, self.share = views, share
+        pose = views.world_from_cam
+        self.position_m = _joined(self.position_m, pose[:, :3, 3])
+        self.quaternion = _joined(self.quaternion, quaternion_from_matrix(pose[:, :3, :3]))
+        self.intrinsics = _joined(self.intrinsics, views.intrinsics)
+        if self.points_m is not None and points is not None:
+            self.points_m = _joined(self.points_m, points.points_m)
+        self.clips = np.arange(len(self.frames) + len(views))[:, None]
+
+    @property
+    def nbytes(self) -> int:
+        """Of all pictures."""
+        return self.images.nbytes + self.views.images.nbytes
+
+    def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Pictures of some rows, frames' and views', (B, 3, H, W)."""
+        count = len(self.frames)
+        return np.stack([self.images[row] if row < count else self.views.images[row - count] for row in rows])
+
+
+def _joined(real: Tensor, views: NDArray[np.floating]) -> Tensor:
+    return torch.cat((real, torch.from_numpy(np.array(views)).to(real)))
+
+
+class MixedSampler(DistributedSampler[int]):
+    """Rows of batches that mix frames and views: an epoch is a pass over the frames.
+
+    Which rows a batch has depends on (seed, epoch) alone. Views go on where the epoch before stopped, each as often as
+    any other.
+
+    Args:
+        data: of which it draws rows; each batch has both.
+        batch_size: rows of a batch, on each device.
+        num_replicas: devices.
+        rank: of this one.
+        seed: of the order.
+
+    Raises:
+        InputError: for a batch of one row.
+    """
+
+    def __init__(self, data: FramesAndViews, batch_size: int, num_replicas: int, rank: int, seed: int) -> None:
+        super().__init__(range(len(data.frames)), num_replicas, rank, shuffle=True, seed=seed)  # type: ignore[arg-type]
+        if batch_size < 2:
+            raise InputError("data.batch_size 1: has no room for a frame and a view. Enlarge it, or set data.views 0.")
+        self.first, self.views, self.batch_size = len(data.frames), len(data.views), batch_size
+        self.real_per_batch = batch_size - min(max(round(data.share * batch_size), 1), batch_size - 1)
+
+    def __len__(self) -> int:
+        return self.batch_size * -(-self.num_samples // self.real_per_batch)
+
+    def __iter__(self) -> Iterator[int]:
+        """Frames, then views of each batch; the last batch has fewer frames where they run out."""
+        real, views = list(super().__iter__()), iter(self._views_of_epoch())
+        for start in range(0, len(real), self.real_per_batch):
+            batch = real[start : start + self.real_per_batch]
+            yield from batch
+            for _ in range(self.batch_size - len(batch)):
+                yield next(views)
+
+    def _views_of_epoch(self) -> list[int]:
+        """This device's rows of views out of one endless sequence of shuffled passes."""
+        needed = (len(self) - self.num_samples) * self.num_replicas
+        turns = np.arange(self.epoch * needed, (self.epoch + 1) * needed)[self.rank :: self.num_replicas]
+        number, place = np.divmod(turns, self.views)
+        orders = {n: np.random.default_rng((self.seed, n)).permutation(self.views) for n in np.unique(number).tolist()}
+        return [self.first + int(orders[n][at]) for n, at in zip(number.tolist(), place.tolist(), strict=True)]

@@ -1,0 +1,70 @@
+"""Scene points that views and frames show, from the depth that views are made from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mambaloc.data.frame_dataset import CachedFrames
+from mambaloc.data.points.scene_points import Points, ScenePoints, frame_rng, stacked
+from mambaloc.geometry import resized_intrinsics
+from mambaloc.synthesis import Splatter, Views
+from mambaloc.synthesis.posed_depth import Floats
+
+_STEP_PX = 2  # frames are rendered so much smaller; of their pixels a few hundred are drawn
+_AT_ONCE = {"cpu": 1}  # frames; more would not fit a core's cache
+_AT_ONCE_ELSEWHERE = 64
+
+
+def points_of_views(views: Views, count: int, seed: int) -> ScenePoints:
+    """Draw pixels of each view and lift them by its depth into the world, at most ``count``."""
+    return ScenePoints(
+        stacked(
+            [
+                _lifted(depth_m, matrix, pose, count, np.random.default_rng((seed, row)))
+                for row, (depth_m, matrix, pose) in enumerate(
+                    zip(views.depth_m, views.intrinsics, views.world_from_cam, strict=True)
+                )
+            ],
+            count,
+        ),
+        "views",
+    )
+
+
+def points_of_frames_by_depth(
+    splatter: Splatter, data: CachedFrames, world_from_cam: Floats, count: int, seed: int
+) -> ScenePoints:
+    """Draw points that frames see, from the depth of the nearest training frames, splatted into their cameras.
+
+    Args:
+        splatter: of training frames with depth.
+        data: N frames, with depth of their own or without.
+        world_from_cam: of these, (N, 4, 4).
+        count: points a frame, at most.
+        seed: of the draw.
+    """
+    height, width = data.images.shape[2:]
+    size = (height // _STEP_PX, width // _STEP_PX)
+    intrinsics = resized_intrinsics(data.intrinsics.double().cpu(), size[1] / width, size[0] / height).numpy()
+    points: list[Points] = []
+    at_once = _AT_ONCE.get(splatter.device.type, _AT_ONCE_ELSEWHERE)
+    for start in range(0, len(world_from_cam), at_once):
+        rows = range(start, min(start + at_once, len(world_from_cam)))
+        depth_m = splatter.render(world_from_cam[rows], intrinsics[rows], size).depth_m.cpu().numpy()
+        points += [
+            _lifted(each, intrinsics[row], world_from_cam[row], count, frame_rng(seed, data.frames.image_paths[row]))
+            for each, row in zip(depth_m, rows, strict=True)
+        ]
+    return ScenePoints(stacked(points, count), "views")
+
+
+def _lifted(
+    depth_m: Floats, intrinsics: Floats, world_from_cam: Floats, count: int, rng: np.random.Generator
+) -> Points:
+    """World points (K, 3) of pixels drawn from those of a picture (H, W) that have a depth."""
+    known = np.flatnonzero(np.isfinite(depth_m))
+    drawn = rng.choice(known, min(count, len(known)), replace=False, shuffle=False)
+    y, x = np.divmod(drawn, depth_m.shape[1])
+    rays = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(intrinsics).T
+    points_cam_m = rays * depth_m.ravel()[drawn, None].astype(np.float64)
+    return points_cam_m @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
