@@ -6,7 +6,6 @@ import shutil
 import warnings
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.data import PoseDataModule
 from mambaloc.data.views import MixedSampler
-from mambaloc.errors import InputError, InputWarning
-from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render, shots_of_sequences
+from mambaloc.errors import InputWarning
+from mambaloc.rendering import embedded_room, embedded_walk, render, shots_of_sequences
 from mambaloc.rendering.scenes.layouts import write_7scenes
 from mambaloc.synthesis import views as making_views
 
@@ -140,7 +139,7 @@ def test_devices_share_frames_and_views(make):
             rows += sampler
         assert sorted(row for row in rows if row < TRAIN) == [*range(TRAIN)]
         views.update(row for row in rows if row >= TRAIN)
-    assert views == {row: 3 * 40 // 24 for row in range(TRAIN, TRAIN + 24)}
+    assert views == dict.fromkeys(range(TRAIN, TRAIN + 24), 3 * 40 // 24)
 
 
 def test_resident_and_loaded_by_workers_batches_are_the_same(make):
