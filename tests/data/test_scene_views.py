@@ -1,0 +1,269 @@
+"""Views beside training frames: made from the depth of these alone, mixed into batches, and left out where bad."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mambaloc.data import PoseDataModule
+from mambaloc.data.views import MixedSampler
+from mambaloc.errors import InputWarning
+from mambaloc.rendering import embedded_room, embedded_walk, render, shots_of_sequences
+from mambaloc.rendering.scenes.layouts import write_7scenes
+from mambaloc.synthesis import views as making_views
+
+SIZE, SHORT_SIDE, CROP = (96, 72), 48, (40, 56)
+TRAIN, VAL, TEST = 40, 12, 8
+
+
+@pytest.fixture(scope="session")
+def room_with_depth(made_once):
+    """A root with one scene, the embedded room: 40 training, 12 validation, 8 test frames, every other with depth."""
+
+    def write(root):
+        walks = {n: embedded_walk(count, n, 0.0, 360 / count) for n, count in ((1, TRAIN), (2, VAL), (3, TEST))}
+        shots = shots_of_sequences(walks, {3})
+        write_7scenes(root, "room", shots, room=embedded_room(), size=SIZE, depth=True, depth_every=2)
+
+    return made_once("room_with_depth", write)
+
+
+@pytest.fixture(scope="session")
+def view_cache(made_once):
+    """A cache of the session, so that a set of views is made once."""
+    return made_once("view_cache", lambda folder: None)
+
+
+@pytest.fixture(autouse=True)
+def _small_parts(monkeypatch):
+    monkeypatch.setattr(making_views, "PART", 8)
+
+
+@pytest.fixture
+def make(room_with_depth, view_cache):
+    def module(root=room_with_depth, **options) -> PoseDataModule:
+        options = {
+            "image_size": CROP, "short_side": SHORT_SIDE, "batch_size": 8, "validation": "sequences",
+            "val_sequences": ["seq-02"], "views": 24, "cache_dir": str(view_cache), **options,
+        }  # fmt: skip
+        data = PoseDataModule("7scenes", str(root), "room", **options)
+        data.setup("fit")
+        return data
+
+    return module
+
+
+def copied(root, tmp_path):
+    """A copy of the scene whose files a test may change."""
+    shutil.copytree(root, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def depth_files(root, sequence=1):
+    return sorted((root / "room" / f"seq-{sequence:02d}").glob("*.depth.png"))
+
+
+def lines_of(make, **options) -> tuple[PoseDataModule, list[str]]:
+    """A module whose training batches are ready, and what the user was told."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        data = make(**options)
+        data.train_dataloader()
+    return data, [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
+
+
+def rows_of(loader) -> list[list[int]]:
+    return [batch.index.tolist() for batch in loader]
+
+
+# --- batches ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("options", "real"), [({}, 2), ({"view_share": 0.5}, 4), ({"view_share": 0.9}, 1)])
+def test_batches_mix_frames_and_views_and_an_epoch_is_a_pass_over_frames(make, options, real):
+    data = make(**options)
+    batches = rows_of(data.train_dataloader())
+    assert all(sum(row < TRAIN for row in batch) == real for batch in batches)
+    assert all(len(batch) == 8 for batch in batches)
+    rows = [row for batch in batches for row in batch]
+    assert sorted(row for row in rows if row < TRAIN) == [*range(TRAIN)]
+    assert max(rows) == TRAIN + 24 - 1
+    described = data.describe()["views"]
+    assert {name: described[name] for name in ("count", "depth", "depth_frames")} == {
+        "count": 24, "depth": "sensor", "depth_frames": TRAIN // 2,
+    }  # fmt: skip
+    assert described["share"] == options.get("view_share", 0.75)
+    assert described["correlation"] > 0.6
+
+
+def test_last_batch_is_filled_up_with_views(make):
+    batches = rows_of(make(keep_count=39, batch_size=8, view_share=0.5).train_dataloader())
+    assert [sum(row < 39 for row in batch) for batch in batches] == [4] * 9 + [3]
+    assert [len(batch) for batch in batches] == [8] * 10
+
+
+def test_order_depends_on_seed_and_epoch_alone_and_uses_views_alike(make, monkeypatch):
+    monkeypatch.setenv("PL_GLOBAL_SEED", "5")
+    loader = make().train_dataloader()
+    epochs = []
+    for epoch in range(4):
+        loader.sampler.set_epoch(epoch)
+        epochs.append(rows_of(loader))
+    again = make().train_dataloader()  # as a resumed training has it
+    again.sampler.set_epoch(2)
+    assert rows_of(again) == epochs[2]
+    assert len({str(epoch) for epoch in epochs}) == 4
+    counts = Counter(row for epoch in epochs for batch in epoch for row in batch)
+    assert {counts[row] for row in range(TRAIN)} == {4}
+    assert {counts[row] for row in range(TRAIN, TRAIN + 24)} == {4 * 20 * 6 // 24}
+
+
+def test_devices_share_frames_and_views(make):
+    data = make(view_share=0.5, batch_size=4)
+    data.train_dataloader()
+    views = Counter()
+    for epoch in range(3):
+        rows = []
+        for rank in range(2):
+            sampler = MixedSampler(data.scene.items("train"), 4, 2, rank, seed=0)
+            sampler.set_epoch(epoch)
+            assert len([*sampler]) == len(sampler) == 40
+            rows += sampler
+        assert sorted(row for row in rows if row < TRAIN) == [*range(TRAIN)]
+        views.update(row for row in rows if row >= TRAIN)
+    assert views == dict.fromkeys(range(TRAIN, TRAIN + 24), 3 * 40 // 24)
+
+
+def test_resident_and_loaded_by_workers_batches_are_the_same(make):
+    loaders = [
+        make(points_per_frame=16, **how).train_dataloader() for how in ({}, {"resident": True}, {"num_workers": 2})
+    ]
+    for batches in zip(*loaders, strict=True):
+        for name in ("image", "position_m", "quaternion", "index", "points_m", "intrinsics"):
+            first, *others = (getattr(batch, name) for batch in batches)
+            for other in others:
+                torch.testing.assert_close(other, first, rtol=0, atol=0, equal_nan=True)
+
+
+def test_views_are_augmented_as_frames_are(make):
+    data = make(augmentation="rotation")
+    batch = next(iter(data.train_dataloader()))
+    out = data.augmented(batch, 3)
+    assert out.image.shape == (8, 3, *CROP)
+    both = (Rotation.from_quat(each.quaternion.double().numpy(), scalar_first=True) for each in (batch, out))
+    before, after = both
+    turns_deg = np.degrees(np.abs((before.inv() * after).as_rotvec()))
+    assert (turns_deg.max(axis=1) > 0.5).all()
+    assert turns_deg.max() <= 10.001
+
+
+# --- what views are --------------------------------------------------------------------------------------------------
+
+
+def test_views_show_what_the_renderer_shows_there(make):
+    data = make()
+    data.train_dataloader()
+    items = data.scene.items("train")
+    batch = items.__getitems__([*range(TRAIN, TRAIN + 24)])
+    off = []
+    for row in range(24):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(batch.quaternion[row].double().numpy(), scalar_first=True).as_matrix()
+        pose[:3, 3] = batch.position_m[row]
+        picture, _ = render(embedded_room(), batch.intrinsics[row].double().numpy(), pose, (64, 48))
+        off.append(np.abs(batch.image[row].permute(1, 2, 0).numpy().astype(float) - picture).mean())
+    assert np.median(off) < 12
+    torch.testing.assert_close(batch.intrinsics, items.intrinsics[:1].expand(24, 3, 3))
+
+
+@pytest.mark.parametrize("view_depth", ["sensor", "pictures"])
+def test_points_lie_on_the_surfaces_that_frames_and_views_show(make, view_depth):
+    """Of frames with depth and without, held out or not, and of views: OpenCV and the renderer agree on them."""
+    data = make(points_per_frame=32, view_depth=view_depth)
+    data.train_dataloader()
+    batches = [
+        data.scene.items("train").__getitems__([0, 1, 18, 33, TRAIN, TRAIN + 9, TRAIN + 23]),
+        data.scene.items("val").__getitems__([0, 1, 7]),
+    ]
+    assert data.describe()["points_source"] == {"train": "views", "val": "views"}
+    ratios = []
+    for batch in batches:
+        for row in range(len(batch.index)):
+            seen = batch.points_m[row].double().numpy()
+            seen = seen[np.isfinite(seen[:, 0])]
+            assert len(seen) >= 24
+            rotation = Rotation.from_quat(batch.quaternion[row].double().numpy(), scalar_first=True).as_matrix()
+            matrix, position_m = batch.intrinsics[row].double().numpy(), batch.position_m[row].double().numpy()
+            shift = -rotation.T @ position_m
+            pixels = cv2.projectPoints(seen, cv2.Rodrigues(rotation.T)[0], shift, matrix, None)[0][:, 0]
+            assert (np.abs(pixels - (31.5, 23.5)) < (32.5, 24.5)).all()
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = rotation, position_m
+            depth_m = render(embedded_room(), matrix, pose, (64, 48))[1]
+            x, y = np.rint(pixels).astype(int).clip(0, (63, 47)).T
+            ratios.append(np.median(((seen - position_m) @ rotation)[:, 2] / depth_m[y, x]))
+    np.testing.assert_allclose(ratios, 1, atol=0.02 if view_depth == "sensor" else 0.05)
+
+
+def test_nothing_but_training_frames_takes_part(make, room_with_depth, tmp_path, monkeypatch):
+    """Views are the same bytes without the depth of held-out, thinned and test frames, which is never opened."""
+    root = copied(room_with_depth, tmp_path)
+    read = []
+    from mambaloc.data.views import depth
+
+    true = depth.read_depth_mm
+    monkeypatch.setattr(depth, "read_depth_mm", lambda path: read.append(path) or true(path))
+    options = {"root": root, "cache_dir": str(tmp_path / "first"), "keep_every": 2}
+    first = make(**options).scene
+    first.add_views(torch.device("cpu"))
+    chosen = {*depth_files(root)[:TRAIN]}
+    assert {*read} == chosen
+    assert len(chosen) == TRAIN // 2
+    for sequence in (2, 3):
+        for file in depth_files(root, sequence):
+            file.write_bytes(b"none")
+    for image in (root / "room" / "seq-03").glob("*.color.png"):
+        image.unlink()
+    second = make(**{**options, "cache_dir": str(tmp_path / "second")}).scene
+    second.add_views(torch.device("cpu"))
+    for name in ("images", "depth_m", "intrinsics", "world_from_cam"):
+        np.testing.assert_array_equal(getattr(second.made_views.views, name), getattr(first.made_views.views, name))
+
+
+def test_thinned_training_reads_depth_of_chosen_frames_alone(make, tmp_path, monkeypatch):
+    from mambaloc.data.views import depth
+
+    read, true = [], depth.read_depth_mm
+    monkeypatch.setattr(depth, "read_depth_mm", lambda path: read.append(path) or true(path))
+    data = make(keep_count=10, cache_dir=str(tmp_path))
+    data.scene.add_views(torch.device("cpu"))
+    chosen = [path for path in data.frames("train").image_paths if depth.depth_path(path).is_file()]
+    assert sorted(read) == sorted(map(depth.depth_path, chosen))
+    assert 0 < len(read) <= 10
+
+
+# --- kept, and made once ---------------------------------------------------------------------------------------------
+
+
+def test_views_are_made_once_and_opened_after_that(make, tmp_path, monkeypatch):
+    from mambaloc.data.views import making
+
+    made = []
+    true = making.depth_of_frames
+    monkeypatch.setattr(making, "depth_of_frames", lambda *args: made.append(1) or true(*args))
+    modules = [make(cache_dir=str(tmp_path)) for _ in range(2)]
+    with ThreadPoolExecutor() as pool:  # the second waits
+        list(pool.map(lambda data: data.scene.add_views(torch.device("cpu")), modules))
+    assert len(made) == 1
+    first, second = (data.scene.made_views for data in modules)
+    np.testing.assert_array_equal(second.views.images, first.views.images)
+    assert second.describe() == first.describe()
+    assert first.seconds > 0
