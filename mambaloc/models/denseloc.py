@@ -125,7 +125,7 @@ class LitDenseLoc(LitPoseRegressor):
     def __init__(
         self,
         backbone: str = "mobilenetv2_100",
-        strides: tuple[int, ...] = (16, 32),
+        strides: tuple[int, ...] = (8, 16),
         dim: int = 192,
         encoder_layers: int = 2,
         heads: int = 6,
