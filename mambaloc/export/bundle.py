@@ -129,13 +129,13 @@ def _write_models(
     export_onnx(system, network, plain, uncertainty)
     model = onnx.load(network)
     int8 = eight_bit(model, data) if "int8" in formats else None
-    models = {"onnx": model}
+    models, focal_px = {"onnx": model}, contract.intrinsics[0][0] if contract.intrinsics else None
     if "fp16" in formats:
         models["fp16"] = half_precision(model)
     if int8 and int8.fits:
         models["int8"] = int8.model
     for name, each in models.items():
-        whole = with_preprocessing(each, contract.preprocessing) if raw_input else each
+        whole = with_preprocessing(each, contract.preprocessing, focal_px) if raw_input else each
         _tell(whole, contract)
         onnx.save(whole, folder / MODEL_FILES[name])
     if "ort" in formats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import onnx
 
-from mambaloc.runtime.contract import INTRINSICS_INPUT, MOST_ENLARGED, RAW_INPUT, Preprocessing
+from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, MOST_ENLARGED, RAW_INPUT, Preprocessing
 
 _PREFIX = "preprocessing_"  # of the names inside
 
@@ -28,7 +28,7 @@ def with_preprocessing(
     """
     height, width = preprocessing.crop
     opset = next(o.version for o in model.opset_import if o.domain in ("", "ai.onnx"))
-    short_side, io_map, given, passed_on = float(preprocessing.short_side), [("network_input", "image")], "", ""
+    short_side, io_map, given, passed_on = float(preprocessing.short_side), [("network_input", IMAGE_INPUT)], "", ""
     if focal_px:
         io_map.append(("network_intrinsics", INTRINSICS_INPUT))
         given, passed_on = f", float[1, 3, 3] {INTRINSICS_INPUT}", ", float[1, 3, 3] network_intrinsics"

@@ -18,6 +18,8 @@ _MOST_PIXELS = 8192  # of a side
 MOST_ENLARGED = 4
 """How many times as large as the training camera's pictures another camera's are made at most; it bounds the memory."""
 METADATA_KEY = "mambaloc"
+IMAGE_INPUT = "image"
+"""Name of the input of models that take what :class:`Preprocessing` makes of an image, in 0..1."""
 RAW_INPUT = "rgb"
 """Name of the input of models that resize, crop and scale by themselves."""
 INTRINSICS_INPUT = "intrinsics"
@@ -120,7 +122,7 @@ class Contract:
         height, width = self.preprocessing.crop
         raw = self.preprocessing.in_model
         tensor = {
-            "name": RAW_INPUT if raw else "image",
+            "name": RAW_INPUT if raw else IMAGE_INPUT,
             "dtype": "uint8" if raw else "float32",
             "shape": ["height", "width", 3] if raw else ["batch", 3, height, width],
             "range": [0, 255] if raw else [0, 1],
