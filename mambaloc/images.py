@@ -98,6 +98,11 @@ def resized(image: Image, short_side: int) -> Image:
 
 
 def center_cropped(image: Image, crop: tuple[int, int]) -> Image:
-    """Take the middle (height, width) of an image."""
+    """Take the middle (height, width) of an image, black where the image is smaller."""
     top, left = (image.shape[0] - crop[0]) // 2, (image.shape[1] - crop[1]) // 2
-    return image[top : top + crop[0], left : left + crop[1]]
+    inside = image[max(top, 0) : top + crop[0], max(left, 0) : left + crop[1]]
+    if inside.shape[:2] == crop:
+        return inside
+    cropped = np.zeros((*crop, *image.shape[2:]), image.dtype)
+    cropped[max(-top, 0) :, max(-left, 0) :][: inside.shape[0], : inside.shape[1]] = inside
+    return cropped

@@ -177,10 +177,10 @@ def errors_by_distance(
     """
     distances: list[Tensor] = []
 
-    def localise(image: Tensor) -> PosePrediction:
+    def localise(image: Tensor, intrinsics: Tensor | None) -> PosePrediction:
         feats = network.forward_backbone(image)
         distances.append(head.distance(pooled(feats)))
-        return network.forward_head(network.features(feats))
+        return network.forward_head(network.features(feats), intrinsics)
 
     table = error_table(localise, data.batches(part))
     return ErrorsByDistance(torch.cat(distances), table.position_error_m, table.rotation_error_deg)

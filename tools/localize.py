@@ -25,7 +25,7 @@ def main() -> None:
         "--intrinsics",
         type=pinhole_matrix,
         metavar="FX,FY,CX,CY",
-        help="of the frames, in pixels; the map's unless given",
+        help="of the frames, in pixels; the training camera's unless given",
     )
     maps = parser.add_mutually_exclusive_group()
     maps.add_argument(

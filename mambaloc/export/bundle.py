@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 import onnx
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.export.maps import check_scene, describe_map, map_vector, scene_intrinsics
+from mambaloc.export.maps import check_scene, describe_map, map_vector
 from mambaloc.export.onnx import contract_of, export_onnx
 from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
@@ -25,7 +26,7 @@ from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.export.quantisation import EightBit, eight_bit
 from mambaloc.files import sha256, whole_folder
 from mambaloc.geometry import canonical
-from mambaloc.images import read_image
+from mambaloc.images import Image, read_image
 from mambaloc.models import LitPoseRegressor
 from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, replay, verify_bundle
 from mambaloc.runtime.contract import METADATA_KEY, MODEL_FILES, Contract
@@ -129,13 +130,13 @@ def _write_models(
     export_onnx(system, network, plain, uncertainty)
     model = onnx.load(network)
     int8 = eight_bit(model, data) if "int8" in formats else None
-    models = {"onnx": model}
+    models, focal_px = {"onnx": model}, contract.intrinsics[0][0] if contract.intrinsics else None
     if "fp16" in formats:
         models["fp16"] = half_precision(model)
     if int8 and int8.fits:
         models["int8"] = int8.model
     for name, each in models.items():
-        whole = with_preprocessing(each, contract.preprocessing) if raw_input else each
+        whole = with_preprocessing(each, contract.preprocessing, focal_px) if raw_input else each
         _tell(whole, contract)
         onnx.save(whole, folder / MODEL_FILES[name])
     if "ort" in formats:
@@ -155,30 +156,46 @@ def _write_frames(
 ) -> list[dict[str, Any]]:
     """Write test frames, evenly spread, with the poses that the system itself finds, and those that its map finds.
 
+    For a system that takes intrinsics there is one of another lens besides: a part of the first frame, not its middle.
     As PNG: no two decoders agree on a JPEG.
     """
     frames = data.frames("test")
-    chosen = frames.select(np.array(frames.evenly_spread(_FRAMES)))
+    rows = frames.evenly_spread(_FRAMES)
+    pictures = [read_image(frames.image_paths[row]) for row in rows]
+    cameras = data.scene.parts["test"].data.cameras.intrinsics[rows]
+    if contract.intrinsics is not None:
+        left = pictures[0].shape[1] // 8
+        pictures.append(pictures[0][:, left:])
+        cameras = np.concatenate([cameras, cameras[:1] - [[0, 0, left], [0, 0, 0], [0, 0, 0]]])
     (folder / "frames").mkdir()
     told: list[dict[str, Any]] = []
-    for number, path in enumerate(chosen.image_paths):
-        rgb, copy = read_image(path), f"frames/{number}.png"
+    for number, (rgb, intrinsics) in enumerate(zip(pictures, cameras, strict=True)):
+        copy = f"frames/{number}.png"
         (folder / copy).write_bytes(cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
-        cropped = contract.preprocessing.apply(rgb)
-        image = torch.from_numpy(np.ascontiguousarray(cropped.transpose(2, 0, 1)))[None].float() / 255
-        with torch.inference_mode():
-            prediction = system.cpu().eval()(image)
-        told.append(
-            {
-                "file": copy,
-                "position_m": prediction.position_m[0].tolist(),
-                "quaternion_wxyz": canonical(prediction.quaternion)[0].tolist(),
-            }
-        )
-    if in_map is not None:
-        for frame, intrinsics in zip(told, scene_intrinsics(data, chosen), strict=True):
-            frame |= map_vector(in_map, folder / frame["file"], intrinsics)
+        described = {"file": copy, **_network_vector(system, contract, rgb, intrinsics)}
+        if contract.intrinsics is not None or in_map is not None:
+            described["intrinsics"] = intrinsics.tolist()
+        if in_map is not None:
+            described["map"] = map_vector(in_map, rgb, intrinsics)
+        told.append(described)
     return told
+
+
+def _network_vector(
+    system: LitPoseRegressor, contract: Contract, rgb: Image, intrinsics: NDArray[np.float64]
+) -> dict[str, Any]:
+    preprocessing, camera = contract.preprocessing, None
+    if contract.intrinsics is not None:
+        preprocessing = contract.preprocessing_for(rgb.shape[:2], intrinsics)
+        camera = torch.from_numpy(preprocessing.crop_from_image(rgb.shape[:2]) @ intrinsics).float()[None]
+    cropped = preprocessing.apply(rgb)
+    image = torch.from_numpy(np.ascontiguousarray(cropped.transpose(2, 0, 1)))[None].float() / 255
+    with torch.inference_mode():
+        prediction = system.cpu().eval()(image, camera)
+    return {
+        "position_m": prediction.position_m[0].tolist(),
+        "quaternion_wxyz": canonical(prediction.quaternion)[0].tolist(),
+    }
 
 
 def _write_trajectory(data: PoseDataModule, folder: Path) -> None:

@@ -11,7 +11,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.data.frames import Frames
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import Image, read_image
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
 from mambaloc.runtime.maps.acceptance import CALIBRATION, LEAST_PROBABILITY, RULE
 from mambaloc.runtime.maps.radii import LEVEL
@@ -84,12 +84,12 @@ def describe_map(sparse_map: SparseMap) -> dict[str, Any]:
     }
 
 
-def map_vector(localiser: MapLocaliser, image: Path, intrinsics: np.ndarray) -> dict[str, Any]:
-    """A frame's camera, and the pose that the map finds; null where that is not accepted."""
-    pose = localiser.localise(read_image(image), intrinsics)
+def map_vector(localiser: MapLocaliser, image: Image, intrinsics: np.ndarray) -> dict[str, Any] | None:
+    """The pose that the map finds of a frame; None where that is not accepted."""
+    pose = localiser.localise(image, intrinsics)
     found = {
         "position_m": pose.position_m.tolist(),
         "quaternion_wxyz": pose.quaternion.tolist(),
         "inliers": pose.inliers,
     }
-    return {"intrinsics": intrinsics.tolist(), "map": found if pose.is_accepted else None}
+    return found if pose.is_accepted else None

@@ -23,7 +23,7 @@ from mambaloc.files import whole_file, writing
 from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork, PositionScale
-from mambaloc.runtime.contract import METADATA_KEY, Contract, Preprocessing
+from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, METADATA_KEY, Contract, Preprocessing
 from mambaloc.uncertainty import UncertaintyHead, pooled
 
 OPSET = 18
@@ -56,18 +56,19 @@ class DeployedNetwork(nn.Module):
         uncertainty: tells how sure each pose is.
 
     Shape:
-        (B, 3, H, W) in 0..1 -> (B, 3) in metres and (B, 4) unit wxyz with ``w >= 0``; with ``uncertainty`` three of
-        (B,) follow, those of :class:`~mambaloc.uncertainty.UncertaintyHead`.
+        (B, 3, H, W) in 0..1, and for a network that takes them intrinsics (B, 3, 3) in its pixels -> (B, 3) in metres
+        and (B, 4) unit wxyz with ``w >= 0``; with ``uncertainty`` three of (B,) follow, those of
+        :class:`~mambaloc.uncertainty.UncertaintyHead`.
     """
 
     def __init__(self, network: PoseNetwork, uncertainty: UncertaintyHead | None = None) -> None:
         super().__init__()
         self.network, self.uncertainty = network, uncertainty
 
-    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> tuple[Tensor, ...]:
         """Localise images."""
         feats = self.network.forward_backbone(image)
-        prediction = self.network.forward_head(self.network.features(feats))
+        prediction = self.network.forward_head(self.network.features(feats), intrinsics)
         pose = (prediction.position_m, canonical(prediction.quaternion))
         return pose if self.uncertainty is None else (*pose, *self.uncertainty(pooled(feats)))
 
@@ -123,7 +124,11 @@ def contract_of(
     preprocessing = Preprocessing(data["short_side"], system.image_size)
     scene = f"{data['dataset']}/{data['scene']}"
     weights, radii = weights_sha256(system.network), None if uncertainty is None else uncertainty.describe()
-    return Contract(system.registry_name, scene, preprocessing, system.provenance, weights, radii)
+    intrinsics = None
+    if system.network.takes_intrinsics:
+        fx, _, cx, _, fy, cy, *_ = system.network.default_intrinsics.double().flatten().tolist()
+        intrinsics = ((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
+    return Contract(system.registry_name, scene, preprocessing, system.provenance, weights, radii, intrinsics)
 
 
 def weights_sha256(network: nn.Module) -> str:
@@ -135,16 +140,17 @@ def weights_sha256(network: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], seed: int = 0) -> Parity:
-    """Compare a file with the network it came from, on random images in several batch sizes."""
+def check_parity(deployed: DeployedNetwork, path: Path, image_size: tuple[int, int], seed: int = 0) -> Parity:
+    """Compare a file with the network it came from, on random images of several cameras in several batch sizes."""
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     generator = torch.Generator().manual_seed(seed)
     position_m, rotation_deg, reach_m, uncertainty = [], [], [], [torch.zeros(())]
     for batch in _CHECKED_BATCHES:
-        image = torch.rand(batch, 3, *image_size, generator=generator)
+        inputs = _random_inputs(deployed.network, batch, image_size, generator)
         with torch.inference_mode():
-            expected_m, expected_q, *expected = deployed(image)
-        actual_m, actual_q, *actual = (torch.from_numpy(a) for a in session.run(None, {"image": image.numpy()}))
+            expected_m, expected_q, *expected = deployed(**inputs)
+        said = session.run(None, {name: tensor.numpy() for name, tensor in inputs.items()})
+        actual_m, actual_q, *actual = map(torch.from_numpy, said)
         position_m.append((actual_m - expected_m).norm(dim=-1).max())
         rotation_deg.append(rotation_error_deg(actual_q, expected_q).max())
         reach_m.append(expected_m.norm(dim=-1).max())
@@ -153,16 +159,29 @@ def check_parity(deployed: nn.Module, path: Path, image_size: tuple[int, int], s
     return Parity(*(torch.stack(each).max().item() for each in differences))  # NaN stays NaN
 
 
-def _write(deployed: nn.Module, contract: Contract, path: Path) -> None:
-    image = torch.zeros(2, 3, *contract.preprocessing.crop)
+def _random_inputs(
+    network: PoseNetwork, batch: int, image_size: tuple[int, int], generator: torch.Generator
+) -> dict[str, Tensor]:
+    """Images, and for a network that takes intrinsics cameras from 0.8 to 1.25 times the usual focal length."""
+    inputs = {IMAGE_INPUT: torch.rand(batch, 3, *image_size, generator=generator)}
+    if network.takes_intrinsics:
+        zoom = 0.8 * (1.25 / 0.8) ** torch.rand(batch, 1, 1, generator=generator)
+        scaled = network.default_intrinsics * torch.tensor([1.0, 1.0, 0.0])
+        inputs[INTRINSICS_INPUT] = network.default_intrinsics + (zoom - 1) * scaled
+    return inputs
+
+
+def _write(deployed: DeployedNetwork, contract: Contract, path: Path) -> None:
+    inputs = _random_inputs(deployed.network, 2, contract.preprocessing.crop, torch.Generator().manual_seed(0))
+    batch = Dim("batch")
     with _quiet():
         program = torch.onnx.export(
             deployed,
-            (image,),
-            input_names=["image"],
+            tuple(inputs.values()),
+            input_names=list(inputs),
             output_names=list(contract.outputs),
             dynamo=True,
-            dynamic_shapes={"image": {0: Dim("batch")}},
+            dynamic_shapes={name: {0: batch} for name in inputs},
             opset_version=OPSET,
             verbose=False,
         )

@@ -4,26 +4,40 @@ from __future__ import annotations
 
 import onnx
 
-from mambaloc.runtime.contract import RAW_INPUT, Preprocessing
+from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, MOST_ENLARGED, RAW_INPUT, Preprocessing
 
 _PREFIX = "preprocessing_"  # of the names inside
 
 
-def with_preprocessing(model: onnx.ModelProto, preprocessing: Preprocessing) -> onnx.ModelProto:
+def with_preprocessing(
+    model: onnx.ModelProto, preprocessing: Preprocessing, focal_px: float | None = None
+) -> onnx.ModelProto:
     """Put :class:`Preprocessing` before a network, as operators that every build of ONNX Runtime has.
 
     Averaging areas is a product with the overlaps of old and new pixels, once for rows and once for columns.
 
+    Args:
+        model: the network.
+        preprocessing: of its input.
+        focal_px: of the training camera in the network's input, for a network that takes intrinsics. Then pictures are
+            resized as :meth:`~mambaloc.runtime.contract.Contract.preprocessing_for` says.
+
     Shape:
-        rgb (height, width, 3) ``uint8`` of any size -> the network's outputs, batch 1.
+        rgb (height, width, 3) ``uint8`` of any size, and perhaps intrinsics (1, 3, 3) in its pixels -> the network's
+        outputs, batch 1.
     """
     height, width = preprocessing.crop
     opset = next(o.version for o in model.opset_import if o.domain in ("", "ai.onnx"))
+    short_side, io_map, given, passed_on = float(preprocessing.short_side), [("network_input", IMAGE_INPUT)], "", ""
+    if focal_px:
+        io_map.append(("network_intrinsics", INTRINSICS_INPUT))
+        given, passed_on = f", float[1, 3, 3] {INTRINSICS_INPUT}", ", float[1, 3, 3] network_intrinsics"
     front = onnx.parser.parse_model(f"""
         <ir_version: {model.ir_version}, opset_import: ["": {opset}]>
-        preprocessing (uint8[height, width, 3] {RAW_INPUT}) => (float[1, 3, {height}, {width}] network_input)
+        preprocessing (uint8[height, width, 3] {RAW_INPUT}{given})
+            => (float[1, 3, {height}, {width}] network_input{passed_on})
         <
-            float short_side = {{{float(preprocessing.short_side)}}},
+            {_camera_constants(preprocessing, focal_px) if focal_px else f"float short_side = {{{short_side}}},"}
             float white = {{255.0}}, float one_f = {{1.0}}, float none = {{0.0}}, int64 zero = {{0}}, int64 one = {{1}},
             int64[1] first = {{0}}, int64[1] second = {{1}}, int64[1] third = {{2}}, int64[1] two = {{2}},
             int64[2] axes = {{2, 3}}, int64[2] crop = {{{height}, {width}}}
@@ -33,6 +47,7 @@ def with_preprocessing(model: onnx.ModelProto, preprocessing: Preprocessing) -> 
             size = Slice(shape, first, third)
             size_f = Cast<to = 1>(size)
             shorter = ReduceMin<keepdims = 0>(size_f)
+            {_SHORT_SIDE_OF_CAMERA if focal_px else ""}
             scale = Div(short_side, shorter)
             scaled = Mul(size_f, scale)
             new_size_f = Round(scaled)
@@ -46,18 +61,70 @@ def with_preprocessing(model: onnx.ModelProto, preprocessing: Preprocessing) -> 
             resized = MatMul(fewer_rows, columns_weight_t)
             whole = Round(resized)
             batch = Unsqueeze(whole, first)
-            spare = Sub(new_size, crop)
-            start = Div(spare, two)
-            end = Add(start, crop)
-            cropped = Slice(batch, start, end, axes)
+            {_CROP_OF_CAMERA if focal_px else _CROP}
             network_input = Div(cropped, white)
         }}
     """)
-    merged = onnx.compose.merge_models(front, model, io_map=[("network_input", "image")], prefix1=_PREFIX)
-    for node in merged.graph.node:
-        node.input[:] = [RAW_INPUT if name == _PREFIX + RAW_INPUT else name for name in node.input]
-    merged.graph.input[0].name = RAW_INPUT
+    merged = onnx.compose.merge_models(front, model, io_map=io_map, prefix1=_PREFIX)
+    for tensor in merged.graph.input:
+        prefixed, tensor.name = tensor.name, tensor.name.removeprefix(_PREFIX)
+        for node in merged.graph.node:
+            node.input[:] = [tensor.name if name == prefixed else name for name in node.input]
     return merged
+
+
+_CROP = """
+            spare = Sub(new_size, crop)
+            start = Div(spare, two)
+            end = Add(start, crop)
+            cropped = Slice(batch, start, end, axes)"""
+
+_SHORT_SIDE_OF_CAMERA = """
+            numbers = Reshape(intrinsics, nine)
+            fx = Slice(numbers, first, second)
+            times_focal = Mul(shorter, focal)
+            as_large = Div(times_focal, fx)
+            rounded = Round(as_large)
+            at_least = Max(rounded, one_f)
+            at_most = Min(at_least, largest)
+            short_side = Squeeze(at_most)"""
+
+_CROP_OF_CAMERA = """
+            lacking_signed = Sub(crop, new_size)
+            lacking = Max(lacking_signed, zero)
+            lacking_and_one = Add(lacking, one)
+            before = Div(lacking_and_one, two)
+            after = Sub(lacking, before)
+            borders = Concat<axis = 0>(before, after)
+            bordered = Pad(batch, borders, none, axes)
+            bordered_size = Add(new_size, lacking)
+            spare = Sub(bordered_size, crop)
+            start = Div(spare, two)
+            end = Add(start, crop)
+            cropped = Slice(bordered, start, end, axes)
+            corner = Sub(start, before)
+            corner_f = Cast<to = 1>(corner)
+            ratio = Div(new_size_f, size_f)
+            larger = Sub(ratio, one_f)
+            centres = Mul(larger, half)
+            shift = Sub(centres, corner_f)
+            ratio_xy = Gather(ratio, x_after_y)
+            shift_xy = Gather(shift, x_after_y)
+            ratios = Concat<axis = 0>(ratio_xy, ones)
+            shifts = Concat<axis = 0>(shift_xy, nones)
+            ratio_column = Reshape(ratios, column)
+            shift_column = Reshape(shifts, column)
+            shift_last = Mul(shift_column, last)
+            rescaled = Mul(intrinsics, ratio_column)
+            network_intrinsics = Add(rescaled, shift_last)"""
+
+
+def _camera_constants(preprocessing: Preprocessing, focal_px: float) -> str:
+    largest = float(MOST_ENLARGED * preprocessing.short_side)
+    return f"""
+            float focal = {{{focal_px}}}, float largest = {{{largest}}}, float half = {{0.5}}, int64[1] nine = {{9}},
+            float[1] ones = {{1.0}}, float[1] nones = {{0.0}}, float[1, 3] last = {{0.0, 0.0, 1.0}},
+            int64[2] x_after_y = {{1, 0}}, int64[2] column = {{3, 1}},"""
 
 
 def _overlaps(axis: str, begin: str, end: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,14 +13,14 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 from torch import Tensor
 
 from mambaloc.data import PoseDataModule
 from mambaloc.metrics import error_table, summarise
-from mambaloc.types import PosePrediction
+from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT
+from mambaloc.types import PoseBatch, PosePrediction
 
 LARGEST_LOSS = 0.1
 """Share of a median error that eight bits may add to it."""
@@ -75,9 +75,9 @@ def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> EightBit:
     data.setup("test")
     prepared = _prepared(model)
     before = median_errors(model, data)
-    images, count = _calibration_images(data), len(data.frames("test"))
+    batches, count = _calibration_batches(data), len(data.frames("test"))
     for kind, kept in (("all layers", []), ("mixed", sensitive_nodes(prepared.graph))):
-        quantised = _quantised(prepared, images, kept)
+        quantised = _quantised(prepared, batches, kept)
         after = median_errors(quantised, data)
         position_m, rotation_deg = (after[name] for name in ("position_error_m", "rotation_error_deg"))
         ratios = [after[name] / max(before[name], 1e-9) for name in ("position_error_m", "rotation_error_deg")]
@@ -94,8 +94,11 @@ def median_errors(model: onnx.ModelProto, data: PoseDataModule) -> dict[str, flo
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
-    def localise(image: Tensor) -> PosePrediction:
-        position_m, quaternion, *_ = session.run(None, {"image": image.numpy()})
+    names = [tensor.name for tensor in session.get_inputs()]
+
+    def localise(image: Tensor, intrinsics: Tensor | None) -> PosePrediction:
+        given = {IMAGE_INPUT: image.numpy(), INTRINSICS_INPUT: None if intrinsics is None else intrinsics.numpy()}
+        position_m, quaternion, *_ = session.run(None, {name: given[name] for name in names})
         return PosePrediction(torch.from_numpy(position_m), torch.from_numpy(quaternion))
 
     return summarise(error_table(localise, data.batches("test")))
@@ -123,13 +126,13 @@ def _prepared(model: onnx.ModelProto) -> onnx.ModelProto:
         return onnx.load(out)
 
 
-def _calibration_images(data: PoseDataModule) -> list[NDArray[np.float32]]:
-    """Training images evenly spread, one at a time."""
+def _calibration_batches(data: PoseDataModule) -> list[PoseBatch]:
+    """Training frames evenly spread, one at a time."""
     rows = data.frames("train").evenly_spread(_CALIBRATION_FRAMES)
-    return [batch.image.numpy() for batch in data.batches("train", rows, size=1)]
+    return list(data.batches("train", rows, size=1))
 
 
-def _quantised(model: onnx.ModelProto, images: Sequence[NDArray[np.float32]], kept: Sequence[str]) -> onnx.ModelProto:
+def _quantised(model: onnx.ModelProto, batches: Sequence[PoseBatch], kept: Sequence[str]) -> onnx.ModelProto:
     """Static QDQ: unsigned activations, signed weights with a scale for each channel.
 
     All eight bits of a weight: in seven, which ONNX Runtime advises for x86 processors without VNNI, MobileNetV2's
@@ -144,7 +147,7 @@ def _quantised(model: onnx.ModelProto, images: Sequence[NDArray[np.float32]], ke
             quantize_static(
                 source,
                 out,
-                _Images(images),
+                _Frames(batches, [tensor.name for tensor in model.graph.input]),
                 quant_format=QuantFormat.QDQ,
                 op_types_to_quantize=[*_PRODUCTS, *_CLIPS],
                 per_channel=True,
@@ -157,11 +160,13 @@ def _quantised(model: onnx.ModelProto, images: Sequence[NDArray[np.float32]], ke
         return onnx.load(out)
 
 
-class _Images(CalibrationDataReader):
-    def __init__(self, images: Sequence[NDArray[np.float32]]) -> None:
-        self._left: Iterator[NDArray[np.float32]] = iter(images)
+class _Frames(CalibrationDataReader):
+    """What a model takes of each batch: its inputs are named as a batch's fields."""
+
+    def __init__(self, batches: Sequence[PoseBatch], names: Sequence[str]) -> None:
+        self._left, self._names = iter(batches), names
 
     def get_next(self) -> dict[str, Any] | None:
-        """One image, or None after the last."""
-        image = next(self._left, None)
-        return None if image is None else {"image": image}
+        """Inputs of one batch, or None after the last."""
+        batch = next(self._left, None)
+        return None if batch is None else {name: getattr(batch, name).numpy() for name in self._names}

@@ -30,11 +30,13 @@ def align_directions(camera: Tensor, world: Tensor, weights: Tensor) -> Tensor:
         [m10 - m01, m02 + m20, m12 + m21, m22 - m00 - m11],
     ]
     davenport = torch.stack([torch.stack(row, dim=-1) for row in entries], dim=-2)
-    power = davenport + torch.eye(4, dtype=davenport.dtype, device=davenport.device)  # eigenvalues in 0..2
+    identity = torch.eye(4, dtype=davenport.dtype, device=davenport.device)
+    power = davenport + identity  # eigenvalues in 0..2
     for _ in range(_SQUARINGS):
-        power = power / power.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        # Not diagonal(), which is a dozen nodes of ONNX.
+        power = power / (power * identity).sum(dim=(-2, -1), keepdim=True)
         power = (power[..., :, :, None] * power[..., None, :, :]).sum(dim=-2)
-    largest = power.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)[..., None, None]
+    largest = (power * identity).sum(dim=-1).argmax(dim=-1)[..., None, None]
     return canonical(power.gather(-2, largest.expand_as(power[..., :1, :])).squeeze(-2))
 
 

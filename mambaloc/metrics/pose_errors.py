@@ -115,18 +115,20 @@ class PoseErrors(Metric):
         return PoseErrorTable.of(index[first], *(dim_zero_cat(state)[first] for state in poses))
 
 
-def error_table(localise: Callable[[Tensor], PosePrediction], batches: Iterable[PoseBatch]) -> PoseErrorTable:
+def error_table(
+    localise: Callable[[Tensor, Tensor | None], PosePrediction], batches: Iterable[PoseBatch]
+) -> PoseErrorTable:
     """Localise frames, and return every frame's prediction and errors.
 
     Only this process's frames count: one process of a distributed training may call it alone.
 
     Args:
-        localise: images, (B, 3, H, W) in 0..1, to poses.
+        localise: images, (B, 3, H, W) in 0..1, and their intrinsics, (B, 3, 3) in pixels, to poses.
         batches: of a split, cropped.
     """
     errors = PoseErrors()
     for batch in batches:
-        errors.update(localise(batch.image), batch)
+        errors.update(localise(batch.image, batch.intrinsics), batch)
     return errors._table()  # table() would wait for the other processes
 
 

@@ -26,6 +26,9 @@ class PoseNetwork(nn.Module):
     takes_intrinsics: ClassVar[bool] = False
     """Whether the pose depends on the camera; other networks are given its intrinsics and leave them unread."""
 
+    default_intrinsics: Tensor
+    """(3, 3): the training camera's, of a network that takes intrinsics; read where none are given."""
+
     backbone: ImageBackbone
     head: PoseHead | CellHead
     image_size: tuple[int, int] | None = None

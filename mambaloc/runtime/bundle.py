@@ -101,7 +101,8 @@ def _deviation(file: str, largest: Replay, entry: dict[str, Any]) -> Deviation:
 def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None) -> Replay:
     """Let a model localise its bundle's frames: largest deviation in mm and degrees, and median latency in ms."""
     localiser = Localiser(model, threads)
-    return _compared([(localiser.localise(model.parent / frame["file"]), frame) for frame in frames])
+    found = [(localiser.localise(model.parent / frame["file"], frame.get("intrinsics")), frame) for frame in frames]
+    return _compared(found)
 
 
 def replay_map(folder: Path, frames: list[dict[str, Any]]) -> Replay:

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from mambaloc.errors import InputError
-from mambaloc.images import Image, center_cropped, resized
+from mambaloc.images import Image, center_cropped, resized, resized_size
+from mambaloc.runtime.maps.features import check_intrinsics
 
 VERSION = 1
 _MOST_PIXELS = 8192  # of a side
+MOST_ENLARGED = 4
+"""How many times as large as the training camera's pictures another camera's are made at most; it bounds the memory."""
 METADATA_KEY = "mambaloc"
+IMAGE_INPUT = "image"
+"""Name of the input of models that take what :class:`Preprocessing` makes of an image, in 0..1."""
 RAW_INPUT = "rgb"
 """Name of the input of models that resize, crop and scale by themselves."""
+INTRINSICS_INPUT = "intrinsics"
+"""Name of the second input of models whose poses depend on the camera. It is never optional: ONNX Runtime uses the
+value of an optional input in Python, ignores it in Node.js and refuses it on the web."""
 MODEL_FILES = {"onnx": "model.onnx", "fp16": "model.fp16.onnx", "int8": "model.int8.onnx", "ort": "model.ort"}
 """What a bundle's models are called, by format, the most exact first."""
 
@@ -44,6 +55,21 @@ class Preprocessing:
         """Resize and crop an RGB image; (H, W, 3) -> (*crop, 3)."""
         return center_cropped(resized(image, self.short_side), self.crop)
 
+    def crop_from_image(self, size: tuple[int, int]) -> NDArray[np.float64]:
+        """Where pixels go: (3, 3), homogeneous ``(x, y)`` of an image of ``size`` (height, width) to its crop's.
+
+        Its product with the image's pinhole matrix is the crop's.
+        """
+        height, width = resized_size(size, self.short_side)
+        y, x = height / size[0], width / size[1]
+        top, left = (height - self.crop[0]) // 2, (width - self.crop[1]) // 2
+        return np.array([[x, 0, (x - 1) / 2 - left], [0, y, (y - 1) / 2 - top], [0, 0, 1]])
+
+    def holds_crop(self, size: tuple[int, int]) -> bool:
+        """Whether an image of ``size`` (height, width) is large enough once it is resized."""
+        height, width = resized_size(size, self.short_side)
+        return height >= self.crop[0] and width >= self.crop[1]
+
 
 @dataclass(frozen=True)
 class Contract:
@@ -56,6 +82,8 @@ class Contract:
         trained: provenance of its training: commit, seed, device, versions.
         weights_sha256: of its parameters and buffers, whatever precision they are stored in.
         uncertainty: how its radii were measured, where it tells them: the share of poses within, on how many frames.
+        intrinsics: the training camera's pinhole matrix in pixels of the crop, for a model that takes intrinsics; what
+            it is fed where the camera is unknown.
         pose: frame, units and order of its outputs.
     """
 
@@ -65,6 +93,7 @@ class Contract:
     trained: dict[str, Any]
     weights_sha256: str
     uncertainty: dict[str, Any] | None = None
+    intrinsics: tuple[tuple[float, float, float], ...] | None = None
     pose: str = POSE
 
     @property
@@ -73,18 +102,41 @@ class Contract:
         pose: dict[str, list[str | int]] = {"position_m": ["batch", 3], "quaternion_wxyz": ["batch", 4]}
         return pose if self.uncertainty is None else pose | {name: ["batch"] for name in UNCERTAINTY}
 
+    def preprocessing_for(self, size: tuple[int, int], intrinsics: ArrayLike) -> Preprocessing:
+        """Resizing that shows things as large as the training camera does; the crop may then be black at its border.
+
+        Networks know things at one scale: with the focal length of the training camera errors stay as they were, with
+        another one they grow by half, although the intrinsics are right.
+
+        Args:
+            size: (height, width) of the camera's images.
+            intrinsics: (3, 3) pinhole matrix in pixels of them.
+        """
+        assert self.intrinsics is not None  # of a model that takes them
+        told = self.preprocessing
+        as_large = round(min(size) * self.intrinsics[0][0] / np.asarray(intrinsics)[0, 0])
+        return replace(told, short_side=min(max(as_large, 1), MOST_ENLARGED * told.short_side))
+
     def to_json(self) -> str:
         """Write it down, with what its input looks like for those who read no code."""
         height, width = self.preprocessing.crop
         raw = self.preprocessing.in_model
         tensor = {
-            "name": RAW_INPUT if raw else "image",
+            "name": RAW_INPUT if raw else IMAGE_INPUT,
             "dtype": "uint8" if raw else "float32",
             "shape": ["height", "width", 3] if raw else ["batch", 3, height, width],
             "range": [0, 255] if raw else [0, 1],
             "colour": "RGB",
         }
-        return json.dumps({"contract": VERSION, **asdict(self), "input": tensor, "outputs": self.outputs}, indent=2)
+        inputs: dict[str, Any] = {"input": tensor}
+        if self.intrinsics is not None:
+            inputs["intrinsics_input"] = {
+                "name": INTRINSICS_INPUT,
+                "dtype": "float32",
+                "shape": [1 if raw else "batch", 3, 3],
+                "in_pixels_of": tensor["name"],
+            }
+        return json.dumps({"contract": VERSION, **asdict(self), **inputs, "outputs": self.outputs}, indent=2)
 
     @classmethod
     def from_json(cls, text: str, where: str) -> Contract:
@@ -113,8 +165,17 @@ class Contract:
                 dict(data["trained"]),
                 str(data["weights_sha256"]),
                 None if data.get("uncertainty") is None else dict(data["uncertainty"]),
+                None if data.get("intrinsics") is None else _matrix(data["intrinsics"], (width, height)),
                 str(data["pose"]),
             )
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             reason = f"{type(error).__name__}: {error}"
             raise InputError(f"{where}: its contract cannot be read ({reason}); export the model anew") from None
+
+
+def _matrix(rows: Any, size: tuple[int, int]) -> tuple[tuple[float, float, float], ...]:
+    try:
+        check_intrinsics(rows, size)
+    except InputError as error:
+        raise ValueError(error) from None
+    return tuple((float(x), float(y), float(z)) for x, y, z in rows)

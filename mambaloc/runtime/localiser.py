@@ -70,17 +70,18 @@ class Localiser:
 
         Args:
             image: a file; or RGB (H, W, 3), or grey (H, W), ``uint8``, of any size.
-            intrinsics: (3, 3) pinhole matrix in its pixels, for the map; the map's own camera unless given, where the
-                image has its shape.
+            intrinsics: (3, 3) pinhole matrix in its pixels, for the map, and for a network that takes intrinsics.
+                Unless given, the training camera's: the map's own, where the image has its shape, and the network's.
 
         Raises:
             InputError: for a file that is missing or no whole image, or an array of another kind; for an image that
-                does not hold the network's crop; and, where there is a map alone, for a camera that is unknown or
-                cannot be.
+                does not hold the network's crop, unless the network is given its intrinsics; for intrinsics that cannot
+                be the image's, where the network takes them or there is a map alone; and, in a map alone, for an image
+                of another shape without them.
         """
         rgb = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
         start = time.perf_counter()
-        network = None if self._network is None else self._network.localise(rgb)
+        network = None if self._network is None else self._network.localise(rgb, intrinsics)
         in_map = self._localise_in_map(rgb, intrinsics, network)
         if in_map is not None:
             _warn_of_focal_length(in_map)

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import Image, resized_size
-from mambaloc.runtime.contract import METADATA_KEY, Contract
+from mambaloc.images import Image
+from mambaloc.runtime.contract import INTRINSICS_INPUT, METADATA_KEY, Contract
 from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.maps.features import check_intrinsics
 
 
 class Network:
@@ -44,14 +45,20 @@ class Network:
         self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
         self._check_input()
 
-    def localise(self, rgb: Image) -> Localisation:
+    def localise(self, rgb: Image, intrinsics: ArrayLike | None = None) -> Localisation:
         """Localise an RGB image (H, W, 3), ``uint8``.
 
+        Args:
+            rgb: the image.
+            intrinsics: (3, 3) pinhole matrix in its pixels, which a model that takes none leaves unread; the training
+                camera's unless given.
+
         Raises:
-            InputError: for an image that does not hold the crop that the network takes.
+            InputError: for intrinsics that cannot be the image's; and, without them, for an image that does not hold
+                the crop that the network takes.
         """
         start = time.perf_counter()
-        said = self._session.run(None, {self._session.get_inputs()[0].name: self._fed(rgb)})
+        said = self._session.run(None, self._feeds(rgb, None if self.contract.intrinsics is None else intrinsics))
         taken_s, (position_m, quaternion, *uncertainty) = time.perf_counter() - start, (each[0] for each in said)
         radius_m, radius_deg, unfamiliarity = map(float, uncertainty) if uncertainty else (None, None, None)
         return Localisation(position_m, quaternion, taken_s, radius_m, radius_deg, unfamiliarity)
@@ -61,22 +68,40 @@ class Network:
         outputs = [output.name for output in self._session.get_outputs()]
         if outputs != list(self.contract.outputs):
             raise InputError(f"{self.path}: says {outputs}, as its contract does not; export it anew")
-        told, given = self.contract.preprocessing, self._session.get_inputs()[0]
+        told, (given, *others) = self.contract.preprocessing, self._session.get_inputs()
         expected = ("tensor(uint8)", [3]) if told.in_model else ("tensor(float)", [3, *told.crop])
         if (given.type, given.shape[-len(expected[1]) :]) != expected:
             raise InputError(
                 f"{self.path}: takes {given.type} {given.shape}, as its contract does not say; export it anew"
             )
+        cameras = [(other.name, other.type, other.shape[-2:]) for other in others]
+        if cameras != ([] if self.contract.intrinsics is None else [(INTRINSICS_INPUT, "tensor(float)", [3, 3])]):
+            named = [other.name for other in others]
+            raise InputError(f"{self.path}: also takes {named}, as its contract does not say. Export it again.")
 
-    def _fed(self, rgb: Image) -> NDArray[np.generic]:
-        preprocessing = self.contract.preprocessing
-        size = resized_size(rgb.shape[:2], preprocessing.short_side)
-        if size[0] < preprocessing.crop[0] or size[1] < preprocessing.crop[1]:
-            given, needed = (f"{width}x{height}" for height, width in (rgb.shape[:2], preprocessing.crop))
+    def _feeds(self, rgb: Image, intrinsics: ArrayLike | None) -> dict[str, NDArray[np.generic]]:
+        contract, size = self.contract, rgb.shape[:2]
+        preprocessing = contract.preprocessing
+        if intrinsics is not None:
+            check_intrinsics(intrinsics, (size[1], size[0]))
+            preprocessing = contract.preprocessing_for(size, intrinsics)
+        elif not preprocessing.holds_crop(size):
+            given, needed = (f"{width}x{height}" for height, width in (size, preprocessing.crop))
             raise InputError(
                 f"image of {given}: resized to short side {preprocessing.short_side} it does not hold the model's crop "
                 f"of {needed}; give frames shaped as in training"
+                + ("" if contract.intrinsics is None else ", or their intrinsics")
             )
         if preprocessing.in_model:
-            return np.ascontiguousarray(rgb)
-        return (preprocessing.apply(rgb).transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32)
+            fed: NDArray[np.generic] = np.ascontiguousarray(rgb)
+        else:
+            fed = (preprocessing.apply(rgb).transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32)
+        feeds = {self._session.get_inputs()[0].name: fed}
+        if contract.intrinsics is not None:
+            crop_from_image = preprocessing.crop_from_image(size)
+            own = (
+                np.linalg.solve(crop_from_image, contract.intrinsics) if intrinsics is None else np.asarray(intrinsics)
+            )
+            matrix = own if preprocessing.in_model else crop_from_image @ own
+            feeds[INTRINSICS_INPUT] = matrix[None].astype(np.float32)
+        return feeds

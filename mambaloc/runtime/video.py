@@ -79,7 +79,7 @@ def follow(
         source: as :func:`~mambaloc.runtime.sources.frames_of` takes it.
         out: the trajectory.
         filtering: one of :data:`FILTERS`; poses are written as found unless given.
-        intrinsics: of every frame, (3, 3) in pixels, for the map; the map's own camera unless given.
+        intrinsics: of every frame, (3, 3) in pixels; the training camera's unless given.
 
     Raises:
         InputError: where there is no such source, it holds no frame, one cannot be localised, none has a pose, or

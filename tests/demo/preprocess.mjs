@@ -8,6 +8,6 @@ const { Preprocessor } = await import(pathToFileURL(join(web, "pictures.js")));
 const cases = JSON.parse(await readFile(join(folder, "cases.json"), "utf8"));
 for (const [number, { width, height, preprocessing }] of cases.entries()) {
   const data = new Uint8Array(await readFile(join(folder, `${number}.rgb`)));
-  const planes = new Preprocessor(preprocessing).apply({ data, width, height, channels: 3 });
+  const planes = new Preprocessor().apply({ data, width, height, channels: 3 }, preprocessing);
   await writeFile(join(folder, `${number}.f32`), planes);
 }

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mambaloc.runtime import Localiser, Preprocessing
+from mambaloc.runtime import Contract, Localiser, Preprocessing
 from mambaloc.runtime.rotations import rotation_error_deg
 
 pytestmark = pytest.mark.slow
@@ -44,6 +44,9 @@ CASES = [  # (height, width) of the picture, short side, crop
     ((640, 480), 256, (224, 224)),
     ((100, 130), 128, (96, 128)),  # enlarged
     ((78, 104), 78, (72, 96)),  # as it is
+    ((480, 640), 60, (72, 96)),  # black beyond the border
+    ((40, 60), 50, (72, 96)),  # likewise, enlarged
+    ((40, 61), 97, (97, 148)),  # enlarged, all of it
 ]
 
 
@@ -60,6 +63,46 @@ def test_pictures_look_to_the_page_as_to_opencv(tmp_path, node):
         expected = Preprocessing(short_side, crop).apply(rgb).transpose(2, 0, 1)
         found = np.frombuffer((tmp_path / f"{number}.f32").read_bytes(), np.float32).reshape(3, *crop)
         np.testing.assert_array_equal((found * 255).round(), expected, err_msg=str(CASES[number]))
+
+
+TRAINED = ((120.0, 0.0, 64.5), (0.0, 121.0, 47.0), (0.0, 0.0, 1.0))
+CAMERAS = [  # (height, width) of the picture, focal length and centre
+    ((480, 640), (533, 533, 322, 236)),
+    ((480, 640), (426, 430, 322, 236)),
+    ((480, 640), (700, 700, 322, 236)),
+    ((640, 480), (533, 533, 238, 321)),
+    ((300, 300), (390, 390, 180, 120)),
+    ((720, 1280), (60, 60, 640, 360)),
+]
+
+
+@pytest.mark.parametrize("in_model", [False, True], ids=["tensors", "pictures"])
+def test_cameras_are_to_the_page_what_they_are_to_python(in_model, node):
+    contract = Contract("echo", "den", Preprocessing(108, (96, 128), in_model), {}, "0", None, TRAINED)
+    told, cases, expected = json.loads(contract.to_json()), [], []
+    for (height, width), (fx, fy, cx, cy) in CAMERAS:
+        intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        cases.append({"image": {"width": width, "height": height}, "intrinsics": intrinsics.tolist()})
+        preprocessing = contract.preprocessing_for((height, width), intrinsics)
+        of_crop = preprocessing.crop_from_image((height, width)) @ intrinsics
+        expected.append((preprocessing.short_side, intrinsics if in_model else of_crop))
+    for height, width in ((480, 640), (720, 1280), (120, 160)):  # of unknown cameras
+        cases.append({"image": {"width": width, "height": height}})
+        crop_from_image = contract.preprocessing.crop_from_image((height, width))
+        expected.append((108, np.linalg.inv(crop_from_image) @ TRAINED if in_model else TRAINED))
+    phone = {"image": {"width": 4000, "height": 3000}, "lens_mm": 26}
+    upright = {"image": {"width": 480, "height": 640}}
+    asked = [{**case, "contract": told} for case in (*cases, phone, upright)]
+    *found, of_phone, refused = json.loads(node(HERE / "framing.mjs", WEB, input=json.dumps(asked)))
+    for each, (short_side, camera) in zip(found, expected, strict=True):
+        assert each["short_side"] == short_side
+        np.testing.assert_allclose(each["camera"], camera, rtol=1e-12, atol=1e-9)
+    diagonal_deg = 2 * np.degrees(np.arctan(np.hypot(36, 24) / 2 / 26))  # what a lens of 26 mm sees on film
+    focal_px = np.hypot(4000, 3000) / 2 / np.tan(np.radians(diagonal_deg / 2))
+    assert of_phone["short_side"] == round(3000 * 120 / focal_px)
+    if in_model:
+        np.testing.assert_allclose(of_phone["camera"], [[focal_px, 0, 1999.5], [0, focal_px, 1499.5], [0, 0, 1]])
+    assert refused["message"].endswith("turn the camera sideways, or say what lens took it.")
 
 
 def code_of(page, language, holding):

@@ -4,6 +4,7 @@ import { describe } from "./about.js";
 import { Engine } from "./engine.js";
 import { TestFrames, deviations } from "./frames.js";
 import { poseOf } from "./geometry.js";
+import { askForLens, outlineCrop, statedCamera } from "./lens.js";
 import { drawMatches } from "./matches.js";
 import { Readout } from "./readout.js";
 import { Film, Stream, decoded, openCamera, optionalJson } from "./sources.js";
@@ -22,6 +23,7 @@ let frames = null;
 let film = null;
 let stream = null;
 let source = "";
+let photo = null; // the last one, for another lens
 let visit = 0; // counts choices of a source; what an earlier one still answers is dropped
 
 async function main() {
@@ -69,6 +71,7 @@ function listen() {
   }
   $("photo").addEventListener("change", ({ target }) => takeFile(target.files[0]));
   $("photo").addEventListener("click", ({ target }) => (target.value = "")); // the same file may be chosen again
+  $("focal").addEventListener("change", () => source === "photo" && takeFile(photo));
   addEventListener("dragover", (event) => event.preventDefault());
   addEventListener("drop", (event) => {
     event.preventDefault();
@@ -121,6 +124,7 @@ async function startEngine(backend) {
     input.checked = input.value === info.backend;
     if (input.value === "webgpu") input.disabled = !info.webgpu;
   }
+  $("sideways").textContent = `Hold the phone sideways${contract.intrinsics ? ", or say what lens it has" : ""}. `;
   $("sideways").hidden = contract.preprocessing.crop[1] <= contract.preprocessing.short_side;
   note(info.notes.join(" "));
   view?.showMap(info.mapPoints);
@@ -145,6 +149,7 @@ async function choose(name) {
   const turn = visit;
   document.querySelector(`[name="source"][value="${name}"]`).checked = true;
   for (const control of document.querySelectorAll(".control")) control.hidden = control.dataset.for !== name;
+  askForLens(name, contract.intrinsics || engine.info.mapPoints);
   const truePath = name === "film" ? film.poses : null;
   document.querySelector(".key .truth").hidden = !truePath;
   view?.showTruePath(truePath);
@@ -205,7 +210,7 @@ function startStream(frameAt = null) {
     try {
       const frame = frameAt?.(seconds);
       const truth = frameAt && poseOf(film.poses[frame]);
-      const pose = await localise(bitmap, truth);
+      const pose = await localise(bitmap, truth, statedCamera(source, bitmap));
       if (turn !== visit) return;
       if (truth) readout.showError(pose, truth, frame);
       readout.show(pose, source);
@@ -219,14 +224,13 @@ function startStream(frameAt = null) {
 /**
  * Localise one picture and show where it was taken; null if another source was chosen meanwhile.
  * @param truth pose, where that is known.
- * @param {number[][]|null} intrinsics of the picture; the map's camera unless given.
+ * @param {number[][]|null} intrinsics of the picture; the training camera's unless given.
  */
 async function localise(bitmap, truth = null, intrinsics = null) {
   const turn = visit;
-  const { width, height } = bitmap;
   try {
-    view?.setPicture(bitmap, width, height);
-    showCrop(width, height);
+    view?.setPicture(bitmap, bitmap.width, bitmap.height);
+    outlineCrop(bitmap, contract, intrinsics);
   } catch (error) {
     bitmap.close();
     throw error;
@@ -253,7 +257,7 @@ async function localiseStill(blob, name, frame = null) {
     const [width, height] = [bitmap.width, bitmap.height].map((side) => Math.max(1, Math.round(side * shrunk)));
     const canvas = Object.assign($("still"), { width, height, hidden: false });
     canvas.getContext("2d").drawImage(bitmap, 0, 0, width, height);
-    const pose = await localise(bitmap, null, frame?.intrinsics);
+    const pose = await localise(bitmap, null, frame ? frame.intrinsics : statedCamera(source, bitmap));
     if (turn !== visit) return null;
     if (frame) readout.showDeviation(deviations(pose, frame, contract).at(-1));
     else readout.forgetErrors();
@@ -268,6 +272,7 @@ async function localiseStill(blob, name, frame = null) {
 
 async function takeFile(file) {
   if (!file || !engine) return;
+  photo = file;
   if (source !== "photo") await choose("photo");
   await localiseStill(file, file.name);
 }
@@ -280,17 +285,6 @@ async function takeFrame(frame) {
   if (blob) return localiseStill(blob, frame.file, frame);
   fail(new Error(`${frame.file} cannot be fetched; is the server still running?`));
   return null;
-}
-
-/** Outline the part of the picture that the model sees. */
-function showCrop(width, height) {
-  const { short_side, crop } = contract.preprocessing;
-  const scale = short_side / Math.min(width, height);
-  const [share, across] = [crop[0] / (height * scale), crop[1] / (width * scale)];
-  $("crop").hidden = share > 1 || across > 1;
-  $("crop").style.setProperty("--height", `${100 * share}%`);
-  $("crop").style.setProperty("--width", `${100 * across}%`);
-  document.querySelector(".picture").style.setProperty("--aspect", width / height);
 }
 
 function showProgress({ name, loaded, total }) {

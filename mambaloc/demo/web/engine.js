@@ -39,7 +39,7 @@ export class Engine {
 
   /**
    * Localise a bitmap, which the worker takes.
-   * @param {number[][]|null} intrinsics of it; the map's camera unless given.
+   * @param {number[][]|null} intrinsics of it; the training camera's unless given.
    */
   localise(bitmap, intrinsics = null) {
     const id = (this.#count += 1);

@@ -39,12 +39,12 @@ export class Localiser {
    * Localise one picture: the map's pose where it is accepted or likelier to be right than the network's, which is the
    * answer otherwise.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
-   * @param {number[][]|null} intrinsics pinhole matrix in its pixels, for the map; the map's camera unless given.
+   * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the training camera's unless given.
    * @returns as {@link Network#localise}; and `source`, "map" or "network"; `network`, its own answer; where there is a
    *   map, `map`, its answer or null, and `map_ms`. Where the map's pose is accepted, the radii are from its covariance.
    */
   async localise(image, intrinsics = null) {
-    const network = await this.#network.localise(image);
+    const network = await this.#network.localise(image, intrinsics);
     if (!this.#map) return { ...network, source: "network", network };
     const start = performance.now();
     const map = this.#map.localise(image, intrinsics, network);

@@ -1,6 +1,7 @@
 /** Poses from pictures with an exported network. No DOM. */
 
-import { Preprocessor, resizedSize } from "./pictures.js";
+import { framing } from "./framing.js";
+import { Preprocessor } from "./pictures.js";
 
 const UNCERTAINTY = ["position_radius_m", "rotation_radius_deg", "unfamiliarity"];
 
@@ -9,13 +10,12 @@ export class Network {
   #ort;
   #session;
   #contract;
-  #preprocessor;
+  #preprocessor = new Preprocessor();
 
   constructor(ort, session, contract) {
     this.#ort = ort;
     this.#session = session;
     this.#contract = contract;
-    this.#preprocessor = new Preprocessor(contract.preprocessing);
   }
 
   /**
@@ -31,14 +31,16 @@ export class Network {
   /**
    * Localise one picture.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
+   * @param {number[][]|null} intrinsics pinhole matrix in its pixels, which a model that takes none leaves unread; the
+   *   training camera's unless given.
    * @returns `world_from_cam`: the camera centre in metres, a unit quaternion wxyz, and what it took; where the model
    *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for a picture of elsewhere.
    */
-  async localise(image) {
+  async localise(image, intrinsics = null) {
     const start = performance.now();
-    const tensor = this.#tensor(image);
+    const feeds = this.#feeds(image, framing(image, this.#contract, intrinsics));
     const fed = performance.now();
-    const found = await this.#session.run({ [this.#contract.input.name]: tensor });
+    const found = await this.#session.run(feeds);
     const position_m = Array.from(found.position_m.data.slice(0, 3), Number);
     const quaternion_wxyz = Array.from(found.quaternion_wxyz.data.slice(0, 4), Number);
     if (![...position_m, ...quaternion_wxyz].every(Number.isFinite)) {
@@ -49,13 +51,18 @@ export class Network {
     return { position_m, quaternion_wxyz, ...Object.fromEntries(told), ...took };
   }
 
-  #tensor(image) {
-    if (this.#contract.preprocessing.in_model) {
-      resizedSize(image, this.#contract.preprocessing);
-      return new this.#ort.Tensor("uint8", asRgb(image), [image.height, image.width, 3]);
+  #feeds(image, { preprocessing, camera }) {
+    const { Tensor } = this.#ort;
+    const { input, intrinsics_input } = this.#contract;
+    const feeds = {};
+    if (camera) feeds[intrinsics_input.name] = new Tensor("float32", Float32Array.from(camera.flat()), [1, 3, 3]);
+    if (preprocessing.in_model) {
+      feeds[input.name] = new Tensor("uint8", asRgb(image), [image.height, image.width, 3]);
+    } else {
+      const planes = this.#preprocessor.apply(image, preprocessing);
+      feeds[input.name] = new Tensor("float32", planes, [1, 3, ...preprocessing.crop]);
     }
-    const [height, width] = this.#contract.preprocessing.crop;
-    return new this.#ort.Tensor("float32", this.#preprocessor.apply(image), [1, 3, height, width]);
+    return feeds;
   }
 }
 

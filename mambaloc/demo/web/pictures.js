@@ -8,22 +8,20 @@
 const IN_UNIT = Float32Array.from({ length: 256 }, (_, value) => value / 255);
 const GREY = [9798, 19235, 3735]; // shares of red, green and blue in 1/32768
 
-/** What an image goes through before the network sees it; keeps its tables while the pictures' size stays. */
+/** What images go through before the network sees them; keeps its tables while size and resizing stay. */
 export class Preprocessor {
-  #preprocessing;
   #plan = null;
-  #size = "";
+  #key = "";
 
-  constructor(preprocessing) {
-    this.#preprocessing = preprocessing;
-  }
-
-  /** Resize, crop and scale; (height, width, channels) in 0..255 -> a new float32 (3, *crop) in 0..1. */
-  apply(image) {
-    const { width, height } = image;
-    if (this.#size !== `${width}x${height}`) {
-      this.#plan = plan(image, this.#preprocessing);
-      this.#size = `${width}x${height}`;
+  /**
+   * Resize, crop and scale; (height, width, channels) in 0..255 -> a new float32 (3, *crop) in 0..1, which is 0 where the
+   * picture does not reach.
+   */
+  apply(image, preprocessing) {
+    const key = [image.width, image.height, preprocessing.short_side].join();
+    if (this.#key !== key) {
+      this.#plan = plan(image, preprocessing);
+      this.#key = key;
     }
     return this.#plan.shrinks ? averagedColours(image, this.#plan) : interpolated(image, this.#plan);
   }
@@ -47,35 +45,34 @@ export function greyPicture({ data, width, height }, scale) {
   return { values: averaged(values, 0, 1, width, areas), width: across, height: down };
 }
 
-/**
- * [height, width] of an image once its shorter side has `short_side` pixels.
- *
- * Throws where the model's crop does not fit into that.
- */
-export function resizedSize({ width, height }, { short_side, crop }) {
-  const scale = short_side / Math.min(width, height);
-  const size = [roundHalfToEven(height * scale), roundHalfToEven(width * scale)];
-  if (size[0] < crop[0] || size[1] < crop[1]) {
-    const how = width < height ? "turn the camera sideways" : "give a picture shaped as in training";
-    throw new Error(
-      `A picture of ${width}×${height} is too narrow: resized to a short side of ${short_side} it does not hold the ` +
-        `model's crop of ${crop[1]}×${crop[0]}; ${how}.`,
-    );
-  }
-  return size;
+/** [height, width] of an image once its shorter side has `shortSide` pixels. */
+export function resizedSize({ width, height }, shortSide) {
+  const scale = shortSide / Math.min(width, height);
+  return [roundHalfToEven(height * scale), roundHalfToEven(width * scale)];
+}
+
+/** Throw where the model's crop does not fit into the resized picture; `orElse` is another way out. */
+export function checkHoldsCrop({ width, height }, { short_side, crop }, orElse = "") {
+  const [newHeight, newWidth] = resizedSize({ width, height }, short_side);
+  if (newHeight >= crop[0] && newWidth >= crop[1]) return;
+  const how = width < height ? "turn the camera sideways" : "give a picture shaped as in training";
+  throw new Error(
+    `A picture of ${width}×${height} is too narrow: resized to a short side of ${short_side} it does not hold the ` +
+      `model's crop of ${crop[1]}×${crop[0]}; ${how}${orElse}.`,
+  );
 }
 
 /** Which source pixels make each pixel of the crop, along either axis. */
 function plan(image, preprocessing) {
-  const [height, width] = resizedSize(image, preprocessing);
+  const [height, width] = resizedSize(image, preprocessing.short_side);
   const [cropHeight, cropWidth] = preprocessing.crop;
   const shrinks = height < image.height;
   const taps = shrinks ? areaTaps : linearTaps;
   return {
     shrinks,
     halves: image.height === 2 * height && image.width === 2 * width,
-    rows: taps(image.height, height, (height - cropHeight) >> 1, cropHeight),
-    columns: taps(image.width, width, (width - cropWidth) >> 1, cropWidth),
+    rows: taps(image.height, height, (height - cropHeight) >> 1, cropHeight, true),
+    columns: taps(image.width, width, (width - cropWidth) >> 1, cropWidth, false),
   };
 }
 
@@ -84,6 +81,8 @@ function areaTaps(source, target, first, count) {
   const scale = 1 / (target / source);
   const [from, ends, weights] = [new Int32Array(count), new Int32Array(count + 1), []];
   for (let i = 0; i < count; i++) {
+    ends[i + 1] = weights.length;
+    if (first + i < 0 || first + i >= target) continue; // beyond the picture
     const start = (first + i) * scale;
     const end = start + scale;
     const cell = Math.min(scale, source - start);
@@ -138,16 +137,20 @@ function averaged(data, channel, channels, width, { rows, columns, halves }) {
   return bytes;
 }
 
-/** Neighbours and their weights in 1/2048, as OpenCV's INTER_LINEAR has them for bytes. */
-function linearTaps(source, target, first, count) {
+/**
+ * Neighbours and their weights in 1/2048, as OpenCV's INTER_LINEAR has them for bytes. At a border it weighs one column
+ * fully, but adds up both shares of one row, each rounded down.
+ */
+function linearTaps(source, target, first, count, isRow) {
   const scale = 1 / (target / source);
   const [from, weights] = [new Int32Array(count), new Int32Array(2 * count)];
   for (let i = 0; i < count; i++) {
+    if (first + i < 0 || first + i >= target) continue; // beyond the picture
     const centre = Math.fround((first + i + 0.5) * scale - 0.5);
     const floor = Math.floor(centre);
     const inside = floor >= 0 && floor < source - 1;
-    const share = inside ? Math.fround(centre - floor) : 0;
-    from[i] = Math.min(Math.max(floor, 0), source - 1);
+    const share = inside || isRow ? Math.fround(centre - floor) : 0;
+    from[i] = isRow ? floor : Math.min(Math.max(floor, 0), source - 1);
     weights[2 * i] = roundHalfToEven(2048 * Math.fround(1 - share));
     weights[2 * i + 1] = roundHalfToEven(2048 * share);
   }
@@ -159,8 +162,7 @@ function interpolated({ data, width, channels }, { rows, columns }) {
   const [height, across] = [rows.from.length, columns.from.length];
   const planes = new Float32Array(3 * height * across);
   for (let y = 0; y < height; y++) {
-    const upper = rows.from[y] * width;
-    const lower = Math.min(rows.from[y] + 1, rows.last) * width;
+    const [upper, lower] = [0, 1].map((i) => width * Math.min(Math.max(rows.from[y] + i, 0), rows.last));
     for (let x = 0; x < across; x++) {
       const left = columns.from[x];
       const right = Math.min(left + 1, columns.last);
@@ -178,7 +180,7 @@ function interpolated({ data, width, channels }, { rows, columns }) {
 }
 
 /** Python's `round`. */
-function roundHalfToEven(value) {
+export function roundHalfToEven(value) {
   const floor = Math.floor(value);
   if (value - floor !== 0.5) return Math.round(value);
   return floor % 2 === 0 ? floor : floor + 1;

@@ -1,0 +1,92 @@
+"""Measure how far off a model's poses are through other lenses: test views of the embedded room by several cameras.
+
+python tools/benchmarks/lenses.py MODEL [--every N]
+
+MODEL is exported from a training on the embedded scene: a file or a bundle. Its map, if there is one, is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import print as rich_print
+from rich.table import Table
+
+from mambaloc import provenance
+from mambaloc.console import exits_cleanly, progress
+from mambaloc.errors import InputError
+from mambaloc.rendering import default_intrinsics, embedded_room, render, sensor
+from mambaloc.rendering.scenes.embedded import embedded_shots
+from mambaloc.rendering.scenes.shots import Shot
+from mambaloc.runtime import Localiser
+from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
+
+LENSES = {  # focal length over the training camera's, and (width, height) in pixels
+    "f x 1, 4:3, as in training": (1.0, (320, 240)),
+    "f x 0.8": (0.8, (320, 240)),
+    "f x 1.25": (1.25, (320, 240)),
+    "f x 1, 16:9": (1.0, (426, 240)),
+    "f x 1, square": (1.0, (240, 240)),
+    "f x 1, 3:4, upright": (1.0, (240, 320)),
+}
+
+
+@exits_cleanly
+def main() -> None:
+    """Localise and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("model", metavar="MODEL")
+    parser.add_argument("--every", type=int, default=1, help="of the test views, every so many-th")
+    args = parser.parse_args()
+    localiser = Localiser(args.model, 1, sparse_map=False)
+    if localiser.contract is None or localiser.contract.intrinsics is None:
+        raise InputError(f"{args.model}: takes no intrinsics. Give a model that does, such as DenseLoc's.")
+    shots = [shot for shot in embedded_shots() if shot.split == "test"][:: args.every]
+    print(provenance.machine())
+    table = Table("camera", "median m", "deg", "mean m", "deg", "over training's", "camera unstated, m", "deg")
+    errors, first = (
+        {name: lens_errors(localiser, shots, name) for name in progress(LENSES, "lenses", len(LENSES))},
+        None,
+    )
+    for name, (stated, unstated) in errors.items():
+        median, mean = np.median(stated, axis=0), stated.mean(axis=0)
+        first = median if first is None else first
+        without = ["-", "-"] if unstated is None else [f"{each:.3f}" for each in np.median(unstated, axis=0)]
+        ratios = "{:.2f} {:.2f}".format(*median / first)
+        table.add_row(name, *(f"{each:.3f}" for each in (*median, *mean)), ratios, *without)
+    rich_print(table)
+    print(f"{len(shots)} views each")
+
+
+def lens_errors(
+    localiser: Localiser, shots: Sequence[Shot], name: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Errors (N, 2) in metres and degrees with the camera stated, and without; None where it must be."""
+    zoom, size = LENSES[name]
+    intrinsics = default_intrinsics(size)
+    intrinsics[0, 0] = intrinsics[1, 1] = zoom * default_intrinsics((320, 240))[0, 0]
+    room, stated, unstated = embedded_room(), [], []
+    for number, shot in enumerate(shots):
+        rgb = sensor(render(room, intrinsics, shot.world_from_cam, size)[0], np.random.default_rng(number))
+        stated.append(error(localiser, rgb, intrinsics, shot))
+        try:
+            unstated.append(error(localiser, rgb, None, shot))
+        except InputError:  # too narrow
+            continue
+    return np.array(stated), np.array(unstated) if unstated else None
+
+
+def error(
+    localiser: Localiser, rgb: NDArray[np.uint8], intrinsics: NDArray[np.float64] | None, shot: Shot
+) -> tuple[float, float]:
+    """Of one view, in metres and degrees."""
+    found = localiser.localise(rgb, intrinsics)
+    off_m = float(np.linalg.norm(found.position_m - shot.world_from_cam[:3, 3]))
+    return off_m, rotation_error_deg(found.quaternion, quaternion_from_matrix(shot.world_from_cam[:3, :3]))
+
+
+if __name__ == "__main__":
+    main()
