@@ -22,6 +22,7 @@ FRAMES = 12
 _SAME_SURFACE = 0.03  # of the depth
 _EDGE = 0.05  # of the depth, over three pixels
 _NEAR = 0.02  # of the median depth
+_FIRST = 4  # frames, in which a view's surfaces are looked up before the others
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,12 @@ class Splatter:
     def __init__(self, source: PosedDepth, device: torch.device | str = "cpu") -> None:
         self.source, self.device = source, torch.device(device)
         self.scale_m = source.median_depth_m
-        self._depth_m = without_edges(torch.from_numpy(source.depth_m).to(self.device)).flatten(1)
+        self._depth_m = without_edges(torch.from_numpy(source.depth_m).to(self.device))
         self._colors = torch.from_numpy(source.images).to(self.device).flatten(2).transpose(1, 2).reshape(-1, 3)
+        y, x = torch.meshgrid(*(torch.arange(length, device=self.device) for length in source.depth_m.shape[1:]), indexing="ij")
+        board = (x + y) % 2 == 0  # half of the pixels; cracks between them are closed
+        self._board_m = self._depth_m[:, board]
+        self._pixels = torch.stack((x[board], y[board], torch.ones_like(x[board])))[:, None].float()
         self._pixel_from_world = source.intrinsics @ np.linalg.inv(source.world_from_cam)[:, :3]
 
     def nearest(self, world_from_cam: Floats, allowed: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
@@ -87,6 +92,7 @@ class Splatter:
         intrinsics: Floats,
         size: tuple[int, int],
         allowed: NDArray[np.bool_] | None = None,
+        most_holes: float = 1.0,
     ) -> Rendered:
         """Render views.
 
@@ -95,65 +101,92 @@ class Splatter:
             intrinsics: of the views, (V, 3, 3), in pixels of ``size``.
             size: (height, width) of the views.
             allowed: which frames each may be made from, (V, S); all unless given.
+            most_holes: views of which surfaces leave more open, as a share of their pixels, stay holes altogether.
         """
-        rows = self.nearest(world_from_cam, allowed)
-        frame = torch.from_numpy(rows).to(self.device)
-        matrix, shift = between(self.source, rows, world_from_cam, intrinsics)
-        nearest = closed(self._z_buffer(frame, self._tensor(matrix), self._tensor(shift), size))
+        frames = self.nearest(world_from_cam, allowed)
+        matrix, shift = between(self.source, frames, world_from_cam, intrinsics)
         back = np.linalg.inv(matrix)
         back_shift = -np.einsum("vnij,vnj->vni", back, shift)
-        colors, depth_m = self._look_up(frame, self._tensor(back), self._tensor(back_shift), nearest)
-        is_known = ~depth_m.isnan()
-        images = filled(torch.where(is_known[:, None], colors, 0), is_known[:, None].to(colors))
-        return Rendered(images.clamp(0, 255).round().byte(), depth_m, 1 - is_known.float().mean(dim=(1, 2)))
+        images, depths_m = [], []
+        for row, rows in enumerate(frames):  # one by one: more would not fit a core's cache
+            few = slice((rows >= 0).sum())
+            frame = torch.from_numpy(rows[few]).to(self.device)
+            nearest = closed(self._z_buffer(frame, self._tensor(matrix[row, few]), self._tensor(shift[row, few]), size))
+            image, depth_m = torch.zeros(3, *size, device=self.device), torch.full_like(nearest, torch.nan)
+            if nearest.isinf().float().mean() <= most_holes:
+                cameras = self._tensor(back[row, few]), self._tensor(back_shift[row, few])
+                self._look_up(frame, *cameras, nearest, image.flatten(1), depth_m.flatten())
+                image = filled(image[None], depth_m.isfinite()[None, None].to(image))[0]
+            images.append(image.clamp_(0, 255).round_().byte())
+            depths_m.append(depth_m)
+        depth_m = torch.stack(depths_m)
+        return Rendered(torch.stack(images), depth_m, depth_m.isnan().float().mean(dim=(1, 2)))
 
     def _z_buffer(self, frame: Tensor, matrix: Tensor, shift: Tensor, size: tuple[int, int]) -> Tensor:
-        """Depth (V, H, W) of the nearest point that falls on each pixel; infinite where none does."""
-        views, (height, width) = len(frame), size
-        depth_m = self._depth_m[frame].masked_fill_((frame < 0)[..., None], torch.nan)
-        seen = carried(matrix, shift, self.source.depth_m.shape[1:], depth_m[:, :, None])
-        z = seen[:, :, 2].contiguous()
-        x, y = (seen[:, :, axis].div(z).round_() for axis in (0, 1))
+        """Depth (H, W) of the nearest point of N frames that falls on each pixel of a view; infinite where none does."""
+        height, width = size
+        x, y, z = seen_from(matrix, shift, self._pixels * self._board_m[frame])
+        x, y = x.div_(z).round_(), y.div_(z).round_()
         is_inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (z > _NEAR * self.scale_m)  # NaN is outside
         pixel = torch.where(is_inside, y.mul_(width).add_(x), height * width).long()
-        pixel += torch.arange(views, device=self.device)[:, None, None] * (height * width + 1)
-        nearest = z.new_full((views * (height * width + 1),), torch.inf)
+        nearest = z.new_full((height * width + 1,), torch.inf)
         nearest.scatter_reduce_(0, pixel.flatten(), z.flatten(), "amin")
-        return nearest.reshape(views, -1)[:, :-1].reshape(views, height, width)
+        return nearest[:-1].reshape(size)
 
-    def _look_up(self, frame: Tensor, matrix: Tensor, shift: Tensor, nearest: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours (V, 3, H, W) and depth (V, H, W) in the first frame that sees each surface; NaN where none does."""
-        views = len(frame)
+    def _look_up(
+        self, frame: Tensor, matrix: Tensor, shift: Tensor, nearest: Tensor, image: Tensor, depth_m: Tensor
+    ) -> None:
+        """Fill in colours (3, H * W) and depth (H * W,) of each surface from the first frame that sees it.
+
+        Args:
+            frame: N of them, the best first.
+            matrix: what carries the view's pixels times their depth to each, (N, 3, 3).
+            shift: likewise, (N, 3).
+            nearest: depth of each pixel, (H, W); infinite where there is none.
+            image: changed in place.
+            depth_m: likewise.
+        """
+        left = nearest.flatten().isfinite().nonzero()[:, 0]
+        for few in (slice(_FIRST), slice(_FIRST, None)):  # most surfaces are seen by the first
+            z = nearest.flatten()[left]
+            points = torch.stack(((left % nearest.shape[1]) * z, (left // nearest.shape[1]) * z, z))
+            is_known, rank, x, y, ratio = self._first_that_sees(frame[few], matrix[few], shift[few], points)
+            found = left[is_known]
+            depth_m[found] = (z * ratio)[is_known]
+            image[:, found] = self._colors_at(frame[few][rank[is_known]], x[is_known], y[is_known])
+            left = left[~is_known]
+            if len(frame) <= _FIRST or not len(left):
+                break
+
+    def _first_that_sees(
+        self, frame: Tensor, matrix: Tensor, shift: Tensor, points: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Whether points (3, P) are seen by any of N frames, by which first, at which x and y, and how much farther."""
         height, width = self.source.depth_m.shape[1:]
-        size = nearest.shape[1:]
-        seen = carried(matrix, shift, size, nearest.reshape(views, 1, 1, -1))
-        z = seen[:, :, 2].contiguous()
-        x, y = (seen[:, :, axis].div(z) for axis in (0, 1))
-        is_inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5) & (z > 0)
-        pixel = torch.where(is_inside, y.round().mul_(width).add_(x.round()), 0).long()
-        pixel += frame.clamp(min=0)[..., None] * (height * width)
-        ratio = self._depth_m.flatten()[pixel].div_(z)
-        agrees = is_inside & ((ratio - 1).abs_() < _SAME_SURFACE) & (frame >= 0)[..., None]
-        is_known, rank = agrees.byte().max(dim=1)  # the first of equals
-        x, y, ratio = (values.gather(1, rank[:, None])[:, 0] for values in (x, y, ratio))
-        is_known = is_known.bool()
-        colors = self._colors_at(frame.gather(1, rank), x.where(is_known, 0), y.where(is_known, 0))
-        depth_m = torch.where(is_known, nearest.flatten(1) * ratio, torch.nan)
-        return colors.reshape(views, 3, *size), depth_m.reshape(views, *size)
+        x, y, z = seen_from(matrix, shift, points[:, None])
+        x, y = x.div_(z), y.div_(z)
+        column, row = x.round(), y.round()
+        is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
+        pixel = torch.where(is_inside, row.mul_(width).add_(column), 0).long()
+        pixel += frame[:, None] * (height * width)
+        ratio = self._depth_m.take(pixel).div_(z)
+        agrees = is_inside & ((ratio - 1).abs_() < _SAME_SURFACE)
+        is_known, rank = agrees.byte().max(dim=0)  # the first of equals
+        x, y, ratio = (values.gather(0, rank[None])[0] for values in (x, y, ratio))
+        return is_known.bool(), rank, x, y, ratio
 
     def _colors_at(self, frame: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Colours of frames at points; all (V, P) -> (V, 3, P)."""
+        """Colours of frames at points; all (P,) -> (3, P)."""
         height, width = self.source.depth_m.shape[1:]
         x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
         left, top = x.long().clamp(max=width - 2), y.long().clamp(max=height - 2)
-        right, below = (x - left)[..., None], (y - top)[..., None]
-        corner = (frame.clamp(min=0) * height + top) * width + left
+        right, below = (x - left)[:, None], (y - top)[:, None]
+        corner = (frame * height + top) * width + left
 
         def between(pixel: Tensor) -> Tensor:
-            first, second = (self._colors[pixel + step].float() for step in (0, 1))
-            return torch.lerp(first, second, right)
+            return torch.lerp(self._colors[pixel].float(), self._colors[pixel + 1].float(), right)
 
-        return torch.lerp(between(corner), between(corner + width), below).transpose(1, 2)
+        return torch.lerp(between(corner), between(corner + width), below).T
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.from_numpy(values).to(self.device, torch.float32)
@@ -187,18 +220,34 @@ def carried(matrix: Tensor, shift: Tensor, size: tuple[int, ...], depth_m: Tenso
     return rays.mul_(depth_m).add_(shift[..., None])
 
 
+def seen_from(matrix: Tensor, shift: Tensor, points: Tensor) -> Tensor:
+    """Pixels times their depth, in N other cameras: (N, 3, 3), (N, 3), (3, N or 1, P) -> (3, N, P)."""
+    if points.shape[1] == 1:
+        seen = (matrix.transpose(0, 1).reshape(-1, 3) @ points[:, 0]).reshape(3, len(matrix), -1)
+    else:
+        seen = torch.bmm(matrix, points.transpose(0, 1)).transpose(0, 1).contiguous()
+    return seen.add_(shift.T[..., None])
+
+
 def without_edges(depth_m: Tensor) -> Tensor:
     """Depth (S, h, w) without pixels beside an edge, where it is of neither surface; NaN there."""
-    farthest = F.max_pool2d(depth_m.nan_to_num(-torch.inf)[:, None], 3, 1, 1)[:, 0]
-    nearest = -F.max_pool2d(-depth_m.nan_to_num(torch.inf)[:, None], 3, 1, 1)[:, 0]
+    farthest, nearest = largest(depth_m.nan_to_num(-torch.inf)), -largest(-depth_m.nan_to_num(torch.inf))
     return depth_m.masked_fill(farthest - nearest > _EDGE * depth_m, torch.nan)
 
 
 def closed(depth_m: Tensor) -> Tensor:
-    """Close cracks of up to two pixels, through which a surface behind shows: (V, H, W), infinite where unknown."""
-    inverse = 1 / depth_m[:, None]
-    dilated = F.max_pool2d(inverse, 3, 1, 1)
-    return 1 / -F.max_pool2d(-dilated, 3, 1, 1)[:, 0]
+    """Close cracks of up to two pixels, through which a surface behind shows: (..., H, W), infinite where unknown."""
+    return 1 / -largest(-largest(1 / depth_m))
+
+
+def largest(values: Tensor) -> Tensor:
+    """The largest of each pixel's 3x3 neighbourhood, (..., H, W); in steps, which are faster than pooling."""
+    for axis in (-1, -2):
+        before, after = values.narrow(axis, 0, values.shape[axis] - 1), values.narrow(axis, 1, values.shape[axis] - 1)
+        values = values.clone()
+        values.narrow(axis, 1, after.shape[axis]).copy_(torch.maximum(before, after))
+        values.narrow(axis, 0, before.shape[axis]).copy_(torch.maximum(values.narrow(axis, 0, before.shape[axis]), after))
+    return values
 
 
 def filled(images: Tensor, known: Tensor) -> Tensor:

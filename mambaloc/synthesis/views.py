@@ -26,11 +26,10 @@ PART = 256
 MOST_HOLES = 0.25
 """Share of a view's pixels that no frame sees, beyond which it is thrown away."""
 
-_VERSION = 1
+_VERSION = 2
 _NEAREST = 0.1  # median depths; nearer surfaces would fill the view with a few pixels of a frame
 _MOST_CROWDED = 0.02  # share of pixels nearer than that
 _DRAWN = 64  # poses at once
-_AT_ONCE = {"cpu": 1}  # views; more would not fit a core's cache
 _LEAST_KEPT = 0.02
 _REMEDY = "make room, or choose another folder"
 
@@ -110,12 +109,10 @@ def _accepted(
     """A part of the views, which depends on nothing but its arguments."""
     kept: list[tuple[NDArray[np.generic], ...]] = []
     rng, tried = np.random.default_rng(seed), 0
-    at_once = _AT_ONCE.get(splatter.device.type, _DRAWN)
     while len(kept) < PART:
         poses = sampler.draw(_DRAWN, rng)
         tried += _DRAWN
-        for start in range(0, _DRAWN, at_once):
-            kept += supported(splatter, poses[start : start + at_once], intrinsics, size)
+        kept += supported(splatter, poses, intrinsics, size)
         if tried > PART and len(kept) < _LEAST_KEPT * tried:
             raise InputError(
                 f"depth of {len(splatter.source)} frames: supports {len(kept)} of {tried} views. "
@@ -132,7 +129,7 @@ def supported(
     poses = world_from_cam[splatter.is_free(world_from_cam[:, :3, 3])]
     if not len(poses):
         return
-    views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size)
+    views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, most_holes=MOST_HOLES)
     crowded_share = (views.depth_m < _NEAREST * splatter.scale_m).float().mean(dim=(1, 2))
     is_good = (views.hole_share <= MOST_HOLES) & (crowded_share <= _MOST_CROWDED)
     for row in is_good.nonzero()[:, 0].tolist():
