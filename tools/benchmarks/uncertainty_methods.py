@@ -18,7 +18,7 @@ from torchmetrics.functional.classification import binary_auroc
 from mambaloc.data import PoseDataModule
 from mambaloc.data.augmentation import center_crop
 from mambaloc.errors import InputError
-from mambaloc.geometry import canonical, position_error_m, rotation_error_deg
+from mambaloc.geometry import canonical, cropped_intrinsics, position_error_m, rotate, rotation_error_deg
 from mambaloc.images import PICTURES, read_image
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork
@@ -37,11 +37,15 @@ PASSES = 8
 REJECTED = 0.2
 """Share of the frames, the least sure ones, that are left out."""
 
+_PLACES = ((0.5, 0.5), (0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0))  # of crops: the middle and the corners
+
 _ByLevel = dict[float, tuple[float, float]]
 """Of position and rotation, by share asked."""
 
-Pictures = Callable[[], Iterator[Tensor]]
-"""Batches of decoded frames, (B, 3, H, W) ``uint8``, larger than the network's crop."""
+Frames = tuple[Tensor, Tensor | None]
+"""Decoded frames, (B, 3, H, W) ``uint8``, larger than the network's crop, and their intrinsics, (B, 3, 3), if known."""
+
+Pictures = Callable[[], Iterator[Frames]]
 
 
 @dataclass(frozen=True)
@@ -176,23 +180,54 @@ def _by_spread(
     network: PoseNetwork, networks: list[PoseNetwork], size: tuple[int, int], test: Pictures, there: Pictures
 ) -> list[Way]:
     """Ways that localise an image several times, and take how far apart the poses are."""
-    told: dict[str, tuple[int, Callable[[Tensor], list[PosePrediction]]]] = {
-        "dropout": (PASSES, lambda image: _dropped_out(network, center_crop(image, size))),
-        "shifted crops": (5, lambda image: [network(each) for each in _crops(image, size)]),
+    told: dict[str, tuple[int, Callable[[Frames], list[PosePrediction]]]] = {
+        "dropout": (PASSES, lambda frames: _dropped_out(network, frames, size)),
+        "shifted crops": (5, lambda frames: [_localised(network, frames, size, place) for place in _PLACES]),
     }
     if len(networks) > 1:
         told[f"ensemble of {len(networks)}"] = (
             len(networks),
-            lambda i: [each(center_crop(i, size)) for each in networks],
+            lambda frames: [_localised(each, frames, size) for each in networks],
         )
-    return [
+    ways = [
         Way(name, passes, *_spreads(poses, test), _spreads(poses, there)[0]) for name, (passes, poses) in told.items()
     ]
+    if not network.takes_intrinsics:
+        return ways
+    position, rotation = _disagreement(network, size, test)
+    return [Way("cells", 1, position, rotation, _disagreement(network, size, there)[0]), *ways]
+
+
+def _localised(
+    network: PoseNetwork, frames: Frames, size: tuple[int, int], place: tuple[float, float] = (0.5, 0.5)
+) -> PosePrediction:
+    """Localise a crop of each frame; ``place`` is 0 at the top or left and 1 at the bottom or right."""
+    image, intrinsics = frames
+    corner = [int((side - crop) * at) for side, crop, at in zip(image.shape[-2:], size, place, strict=True)]
+    crop = image[..., corner[0] : corner[0] + size[0], corner[1] : corner[1] + size[1]].float() / 255
+    return network(crop, None if intrinsics is None else cropped_intrinsics(intrinsics, *corner))
 
 
 @torch.inference_mode()
-def _spreads(poses: Callable[[Tensor], list[PosePrediction]], pictures: Pictures) -> tuple[Tensor, Tensor]:
-    spreads = [pose_spread(poses(image)) for image in pictures()]
+def _disagreement(network: PoseNetwork, size: tuple[int, int], pictures: Pictures) -> tuple[Tensor, Tensor]:
+    """How far a dense head's cells are from the pose solved of them, in metres and degrees; (N,) each."""
+    position, rotation = [torch.zeros(0)], [torch.zeros(0)]
+    for frames in pictures():
+        prediction = _localised(network, frames, size)
+        if (cells := prediction.cells) is None:
+            return position[0], rotation[0]
+        apart_m = position_error_m(cells.position_m, prediction.position_m[:, None])
+        position.append((apart_m * cells.position_weights).sum(dim=1))
+        if cells.rays_world is not None:
+            turned = rotate(prediction.quaternion[:, None], cells.rays_cam)
+            apart_deg = torch.rad2deg(2 * torch.asin((cells.rays_world - turned).norm(dim=-1) / 2))
+            rotation.append((apart_deg * cells.rotation_weights).sum(dim=1))
+    return torch.cat(position), torch.cat(rotation)
+
+
+@torch.inference_mode()
+def _spreads(poses: Callable[[Frames], list[PosePrediction]], pictures: Pictures) -> tuple[Tensor, Tensor]:
+    spreads = [pose_spread(poses(frames)) for frames in pictures()]
     none = torch.zeros(0)
     positions, rotations = zip((none, none), *spreads, strict=True)
     return torch.cat(positions), torch.cat(rotations)
@@ -209,7 +244,7 @@ def pose_spread(poses: list[PosePrediction]) -> tuple[Tensor, Tensor]:
     return apart_m.square().mean(0).sqrt(), apart_deg.square().mean(0).sqrt()
 
 
-def _dropped_out(network: PoseNetwork, image: Tensor) -> list[PosePrediction]:
+def _dropped_out(network: PoseNetwork, frames: Frames, size: tuple[int, int]) -> list[PosePrediction]:
     """Poses with dropout as in training (Gal and Ghahramani 2016), the same draws for every batch."""
     drops = [module for module in network.modules() if isinstance(module, nn.Dropout)]
     try:
@@ -217,31 +252,23 @@ def _dropped_out(network: PoseNetwork, image: Tensor) -> list[PosePrediction]:
             module.train()
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            return [network(image) for _ in range(PASSES)]
+            return [_localised(network, frames, size) for _ in range(PASSES)]
     finally:
         network.eval()
 
 
-def _crops(image: Tensor, size: tuple[int, int]) -> list[Tensor]:
-    """The middle and the four corners."""
-    height, width = size
-    bottom, right = image.shape[-2] - height, image.shape[-1] - width
-    corners = [image[..., y : y + height, x : x + width].float() / 255 for y in (0, bottom) for x in (0, right)]
-    return [center_crop(image, size), *corners]
-
-
 @torch.inference_mode()
 def _distances(network: PoseNetwork, head: UncertaintyHead, size: tuple[int, int], pictures: Pictures) -> Tensor:
-    distances = [head.distance(pooled(network.backbone(center_crop(image, size)))) for image in pictures()]
+    distances = [head.distance(pooled(network.backbone(center_crop(image, size)))) for image, _ in pictures()]
     return torch.cat([torch.zeros(0), *distances])
 
 
-def _no_pictures() -> Iterator[Tensor]:
+def _no_pictures() -> Iterator[Frames]:
     return iter(())
 
 
 def _test_frames(data: PoseDataModule) -> Pictures:
-    return lambda: (batch.image for batch in data.test_dataloader())
+    return lambda: ((batch.image, batch.intrinsics) for batch in data.test_dataloader())
 
 
 def _pictures_of(folder: Path, data: PoseDataModule) -> Pictures:
@@ -249,9 +276,9 @@ def _pictures_of(folder: Path, data: PoseDataModule) -> Pictures:
     paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in PICTURES)
     if not paths:
         raise InputError(f"--elsewhere {folder}: holds no {', '.join(PICTURES)}; give a folder of pictures")
-    height, width = next(_test_frames(data)()).shape[-2:]
+    height, width = next(_test_frames(data)())[0].shape[-2:]
 
-    def read() -> Iterator[Tensor]:
+    def read() -> Iterator[Frames]:
         for path in paths:
             rgb = read_image(path)
             scale = min(rgb.shape[0] / height, rgb.shape[1] / width)
@@ -259,6 +286,6 @@ def _pictures_of(folder: Path, data: PoseDataModule) -> Pictures:
             top, left = (rgb.shape[0] - rows) // 2, (rgb.shape[1] - columns) // 2
             middle = np.ascontiguousarray(rgb[top : top + rows, left : left + columns])
             shaped = cv2.resize(middle, (width, height), interpolation=cv2.INTER_AREA)
-            yield torch.from_numpy(shaped.transpose(2, 0, 1).copy())[None]
+            yield torch.from_numpy(shaped.transpose(2, 0, 1).copy())[None], None
 
     return read
