@@ -24,6 +24,7 @@ from mambaloc.callbacks import (
     OnnxExport,
     PoseProgressBar,
     TrajectoryPlot,
+    ViewSheet,
     WallClock,
     WholeCheckpoints,
 )
@@ -80,6 +81,7 @@ class RecipeCLI(LightningCLI):
             "map": MapBuild,
             "onnx_export": OnnxExport,
             "trajectory_plot": TrajectoryPlot,
+            "view_sheet": ViewSheet,
             "best_checkpoint": ModelCheckpoint,
             "last_checkpoint": ModelCheckpoint,  # a callback of its own: `save_last` follows the best one only
         }.items():

@@ -159,7 +159,10 @@ class LitDistillation(LitStudent):
     def on_fit_start(self) -> None:
         """With ``cache_teacher``, ask it for every training frame."""
         if self.hparams["cache_teacher"]:
-            batches = self.scene_for("cache_teacher").batches("train")
+            data = self.scene_for("cache_teacher")
+            if data.hparams["views"]:
+                raise InputError("model.cache_teacher: asks of frames alone, not of data.views. Set one of them off.")
+            batches = data.batches("train")
             shown = track(batches, "Asking the teacher", transient=True, disable=self.global_rank > 0)
             answers = [self.teacher(batch.image.to(self.device)) for batch in shown]
             self.answers = Answers(*(torch.cat(each) for each in zip(*answers, strict=True)))

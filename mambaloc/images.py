@@ -19,6 +19,9 @@ Image = NDArray[np.uint8]
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 """Suffixes of files that are taken for images."""
 
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in grey: ITU-R BT.601, as torchvision and PIL have them."""
+
 LARGEST_SIDE_PX = 32_766
 """Longest side of an image, and of cameras: ``cv2.remap``, which removes distortion, takes no longer one."""
 

@@ -5,6 +5,7 @@ from mambaloc.callbacks.map_build import MapBuild
 from mambaloc.callbacks.onnx_export import OnnxExport
 from mambaloc.callbacks.progress import PoseProgressBar
 from mambaloc.callbacks.trajectory_plot import TrajectoryPlot
+from mambaloc.callbacks.view_sheet import ViewSheet
 from mambaloc.callbacks.wall_clock import WallClock
 from mambaloc.callbacks.whole_checkpoints import WholeCheckpoints
 
@@ -14,6 +15,7 @@ __all__ = [
     "OnnxExport",
     "PoseProgressBar",
     "TrajectoryPlot",
+    "ViewSheet",
     "WallClock",
     "WholeCheckpoints",
 ]

@@ -24,9 +24,9 @@ from mambaloc.geometry import (
     rotation_homography,
     warped,
 )
+from mambaloc.images import LUMA
 from mambaloc.types import PoseBatch
 
-_LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as torchvision and PIL
 _MOST_DEG = 45.0
 
 View = Literal["crop", "rotation"]
@@ -51,7 +51,7 @@ class Jitter:
             )
         )
         means = image[..., ::4, ::4].float().mean((-2, -1)) / 255
-        luma_mean = sum((weight * mean for weight, mean in zip(_LUMA, means.unbind(-1), strict=True)), torch.zeros(()))
+        luma_mean = sum((weight * mean for weight, mean in zip(LUMA, means.unbind(-1), strict=True)), torch.zeros(()))
         return color_matrices(brightness, contrast, saturation, luma_mean)
 
 
@@ -147,7 +147,7 @@ def color_matrices(brightness: Tensor, contrast: Tensor, saturation: Tensor, lum
         luma_mean: mean luma of the image before the adjustments, in 0..1.
     """
     # No constant tensors: making one on a GPU waits for it.
-    luma_B3 = torch.stack([(1 - saturation) * weight for weight in _LUMA], dim=-1)
+    luma_B3 = torch.stack([(1 - saturation) * weight for weight in LUMA], dim=-1)
     saturate_B33 = torch.diag_embed(saturation[:, None].expand(-1, 3)) + luma_B3[:, None]
     gain, offset = contrast * brightness, (1 - contrast) * brightness * luma_mean  # saturation leaves gray as it is
     return torch.cat((saturate_B33 * gain[:, None, None], offset[:, None, None].expand(-1, 3, 1)), dim=-1)

@@ -18,7 +18,7 @@ from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.frames import Frames, OnBadFrame, Split
 from mambaloc.data.scene import Scene
 from mambaloc.data.splits import Validation
-from mambaloc.data.views import FramesAndViews, MixedSampler, ViewDepth
+from mambaloc.data.views import FramesAndViews, MixedSampler, SceneViews, ViewDepth
 from mambaloc.errors import InputError
 from mambaloc.geometry import cropped_intrinsics
 from mambaloc.types import PoseBatch
@@ -153,6 +153,11 @@ class PoseDataModule(L.LightningDataModule):
             InputError: where there is none.
         """
         return self.scene.choose()[0][0]
+
+    @property
+    def scene_views(self) -> SceneViews | None:
+        """Views of the training frames, and how good they are, once training batches were asked for."""
+        return self.scene.made_views
 
     def frames(self, part: Split) -> Frames:
         """Return the frames of a part, in the order of ``PoseBatch.index``."""

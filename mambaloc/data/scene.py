@@ -172,20 +172,14 @@ class Scene:
             return
         self._is_viewed = True
         self.made_views = made = self._made_views(device)
-        if made is None or made.views is None:
-            self.parts.update({part: self._with_points(each) for part, each in self.parts.items() if part != "test"})
-            return
-        count, seed = self.points_per_frame, provenance.seed()
-        if count:
-            splatter = Splatter(made.source, device)
-            for part in ("train", "val"):
-                if loaded := self.parts.get(part):
-                    data = loaded.data
-                    points = points_of_frames_by_depth(splatter, data, poses_of(data.frames), count, seed)
-                    seeing = CachedFrames(data.frames, data.images, data.cameras, points)
-                    self.parts[part] = replace(loaded, data=seeing)
-        of_views = points_of_views(made.views, count, seed) if count else None
-        self._mixed = FramesAndViews(self.parts["train"].data, made.views, made.share, of_views)
+        views = None if made is None else made.views
+        splatter = Splatter(made.source, device) if made and views and self.points_per_frame else None
+        for part in ("train", "val"):
+            if part in self.parts:
+                self.parts[part] = self._with_points(self.parts[part], splatter)
+        if made and views:
+            points = points_of_views(views, self.points_per_frame, provenance.seed()) if splatter else None
+            self._mixed = FramesAndViews(self.parts["train"].data, views, made.share, points)
 
     def items(self, part: Split) -> CachedFrames:
         """What batches of a part are made of: its frames, and views beside those that are trained on."""
@@ -227,7 +221,7 @@ class Scene:
             "short_side": self.short_side,
             "cameras": {part: loaded.data.cameras.describe() for part, loaded in self.parts.items()},
             **describe_points(self.parts),
-            **({"views": self.made_views.describe()} if self.made_views else {}),
+            **({"views": self.made_views.describe() if self.made_views else {"count": 0}} if self._is_viewed else {}),
             **(describe_capture(self.folder) if self.dataset == CAPTURE else {}),
         }
 
@@ -245,12 +239,21 @@ class Scene:
         cameras_of = partial(known_or_assumed_cameras, self.dataset, self.folder)
         return load_split(frames, bad, cameras_of, self.short_side, self.crop, self.cache_dir)
 
-    def _with_points(self, loaded: LoadedSplit) -> LoadedSplit:
-        """Add what each frame may see, of the frames that could be decoded."""
-        if self.points_per_frame == 0 or (self.views and not self._is_viewed):  # views say where from
+    def _with_points(self, loaded: LoadedSplit, splatter: Splatter | None = None) -> LoadedSplit:
+        """Add what each frame may see, of the frames that could be decoded; from views' depth where that is given."""
+        if self.points_per_frame == 0 or (self.views and not self._is_viewed):  # views say where points are from
             return loaded
-        data = loaded.data
-        points = read_points(self.folder, data.frames, data.cameras, self.points_per_frame, provenance.seed())
+        data, count, seed = loaded.data, self.points_per_frame, provenance.seed()
+        if splatter:
+            points = points_of_frames_by_depth(splatter, data, poses_of(data.frames), count, seed)
+        else:
+            try:
+                points = read_points(self.folder, data.frames, data.cameras, count, seed)
+            except InputError as error:
+                if self.views == 0:
+                    raise
+                warnings.warn(f"{error}. The training goes on without points.", InputWarning, stacklevel=2)
+                return loaded
         return replace(loaded, data=CachedFrames(data.frames, data.images, data.cameras, points))
 
     def _in_clips(self, loaded: LoadedSplit, thinned_by: float) -> LoadedSplit:

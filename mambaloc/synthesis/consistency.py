@@ -55,13 +55,15 @@ def without_disagreeing(source: PosedDepth, names: Sequence[str]) -> tuple[Posed
         the frames that are left; and those that are not, by name, with the share of their depth that others meet.
 
     Raises:
-        InputError: where most frames disagree: then it is their unit, or the poses.
+        InputError: where most frames disagree, or are too small or large for others to see what they saw: then it is
+            their unit, or the poses.
     """
     shares = agreement(source)
     off = {name: float(share) for name, share in zip(names, shares, strict=True) if share < LEAST_AGREEMENT}
-    if len(off) > len(source) / 2:
+    unmet = np.flatnonzero(~(shares >= LEAST_AGREEMENT))
+    if len(unmet) > len(source) / 2:
         raise InputError(
-            f"{next(iter(off))}: depth of this and {len(off) - 1} more of {len(source)} frames disagrees with the "
+            f"{names[unmet[0]]}: depth of this and {len(unmet) - 1} more of {len(source)} frames disagrees with the "
             "poses. Check the unit of both, or do without depth."
         )
     return source.select(~(shares < LEAST_AGREEMENT)), off  # NaN stays

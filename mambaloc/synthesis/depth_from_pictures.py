@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from mambaloc.synthesis.plane_sweep import PlaneSweep, SweepSettings
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 
 _KEY_FRAMES = 160
+_SEARCHED_PX = 54  # shorter side, about: more takes longer, and finds no better depth
 _POINTS_INSIDE = (0.01, 0.99)  # of the depths
 _MARGIN = 1.3
 _TRIAL_FRAMES, _TRIAL_OTHERS = 6, 1
@@ -43,19 +45,43 @@ def depth_from_pictures(
     Raises:
         InputError: where hardly any depth is confirmed: poses or cameras do not fit the pictures.
     """
+    small, matrices = searched(images, intrinsics)
     if points_m is None:
-        range_m = range_from_pictures(images, intrinsics, world_from_cam, device)
+        range_m = range_from_pictures(small, matrices, world_from_cam, device)
     else:
         range_m = range_of_points(points_m, intrinsics, world_from_cam, images.shape[2:])
-    sweep = PlaneSweep(images, intrinsics, world_from_cam, range_m, settings, device)
+    sweep = PlaneSweep(small, matrices, world_from_cam, range_m, settings, device)
     rows = spread_rows(world_from_cam, sweep.scale_m, key_frames)
-    found = confirmed(PosedDepth(images[rows], sweep.depth_m(rows), intrinsics[rows], world_from_cam[rows]))
+    depth_m = enlarged(sweep.depth_m(rows), images.shape[2:])
+    found = confirmed(PosedDepth(images[rows], depth_m, intrinsics[rows], world_from_cam[rows]))
     if np.isfinite(found.depth_m).mean() < _LEAST_KNOWN:
         raise InputError(
             f"{len(images)} pictures: no depth is found that several of them confirm. Check poses and cameras, or "
             "do without views."
         )
     return found
+
+
+def searched(images: NDArray[np.uint8], intrinsics: Floats) -> tuple[NDArray[np.uint8], Floats]:
+    """Pictures and their cameras at the size at which depth is searched: a whole part of theirs, about 54 pixels."""
+    height, width = images.shape[2:]
+    part = max(1, round(min(height, width) / _SEARCHED_PX))
+    if part == 1:
+        return images, intrinsics
+    size = (width // part, height // part)
+    small = [
+        cv2.resize(each.transpose(1, 2, 0), size, interpolation=cv2.INTER_AREA).transpose(2, 0, 1) for each in images
+    ]
+    scale = np.diag((size[0] / width, size[1] / height, 1.0))
+    scale[:2, 2] = (scale[[0, 1], [0, 1]] - 1) / 2  # pixel centres
+    return np.stack(small), scale @ intrinsics
+
+
+def enlarged(depth_m: NDArray[np.float32], size: tuple[int, ...]) -> NDArray[np.float32]:
+    """Depth (S, h, w) at a size (height, width); inverse depth is linear between pixels."""
+    if depth_m.shape[1:] == size:
+        return depth_m
+    return np.stack([1 / cv2.resize(1 / each, size[::-1], interpolation=cv2.INTER_LINEAR) for each in depth_m])
 
 
 def range_of_points(

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mambaloc.images import LUMA
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 from mambaloc.synthesis.splatting import Splatter
 
@@ -19,7 +20,6 @@ LEAST_CORRELATION = 0.45
 _APART = 0.2  # see PosedDepth.apart: about as far as views lie from the frames
 _WINDOW_PX = 9
 _NOISE = 2.0  # grey levels, standard deviation
-_GREY = (0.299, 0.587, 0.114)
 _USUAL_SHARE = 0.75
 
 
@@ -79,7 +79,7 @@ def held_out_quality(source: PosedDepth, count: int = 40, device: torch.device |
 
 def _correlation(first: Tensor, second: Tensor) -> Tensor:
     """Correlation of grey around each pixel, (V, 3, H, W) uint8 twice -> (V, H, W)."""
-    weights = torch.tensor(_GREY, device=first.device)[:, None, None]
+    weights = torch.tensor(LUMA, device=first.device)[:, None, None]
     a, b = ((image.float() * weights).sum(dim=1, keepdim=True) for image in (first, second))
 
     def mean(values: Tensor) -> Tensor:

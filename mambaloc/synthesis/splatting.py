@@ -51,7 +51,9 @@ class Splatter:
         self.scale_m = source.median_depth_m
         self._depth_m = without_edges(torch.from_numpy(source.depth_m).to(self.device))
         self._colors = torch.from_numpy(source.images).to(self.device).flatten(2).transpose(1, 2).reshape(-1, 3)
-        y, x = torch.meshgrid(*(torch.arange(length, device=self.device) for length in source.depth_m.shape[1:]), indexing="ij")
+        y, x = torch.meshgrid(
+            *(torch.arange(length, device=self.device) for length in source.depth_m.shape[1:]), indexing="ij"
+        )
         board = (x + y) % 2 == 0  # half of the pixels; cracks between them are closed
         self._board_m = self._depth_m[:, board]
         self._pixels = torch.stack((x[board], y[board], torch.ones_like(x[board])))[:, None].float()
@@ -123,7 +125,7 @@ class Splatter:
         return Rendered(torch.stack(images), depth_m, depth_m.isnan().float().mean(dim=(1, 2)))
 
     def _z_buffer(self, frame: Tensor, matrix: Tensor, shift: Tensor, size: tuple[int, int]) -> Tensor:
-        """Depth (H, W) of the nearest point of N frames that falls on each pixel of a view; infinite where none does."""
+        """Depth (H, W) of the nearest point of N frames on each pixel of a view; infinite where there is none."""
         height, width = size
         x, y, z = seen_from(matrix, shift, self._pixels * self._board_m[frame])
         x, y = x.div_(z).round_(), y.div_(z).round_()
@@ -148,6 +150,8 @@ class Splatter:
         """
         left = nearest.flatten().isfinite().nonzero()[:, 0]
         for few in (slice(_FIRST), slice(_FIRST, None)):  # most surfaces are seen by the first
+            if not len(left) or not len(frame[few]):
+                break
             z = nearest.flatten()[left]
             points = torch.stack(((left % nearest.shape[1]) * z, (left // nearest.shape[1]) * z, z))
             is_known, rank, x, y, ratio = self._first_that_sees(frame[few], matrix[few], shift[few], points)
@@ -155,8 +159,6 @@ class Splatter:
             depth_m[found] = (z * ratio)[is_known]
             image[:, found] = self._colors_at(frame[few][rank[is_known]], x[is_known], y[is_known])
             left = left[~is_known]
-            if len(frame) <= _FIRST or not len(left):
-                break
 
     def _first_that_sees(
         self, frame: Tensor, matrix: Tensor, shift: Tensor, points: Tensor
@@ -246,7 +248,9 @@ def largest(values: Tensor) -> Tensor:
         before, after = values.narrow(axis, 0, values.shape[axis] - 1), values.narrow(axis, 1, values.shape[axis] - 1)
         values = values.clone()
         values.narrow(axis, 1, after.shape[axis]).copy_(torch.maximum(before, after))
-        values.narrow(axis, 0, before.shape[axis]).copy_(torch.maximum(values.narrow(axis, 0, before.shape[axis]), after))
+        values.narrow(axis, 0, before.shape[axis]).copy_(
+            torch.maximum(values.narrow(axis, 0, before.shape[axis]), after)
+        )
     return values
 
 

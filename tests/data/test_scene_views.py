@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 import warnings
 from collections import Counter
@@ -14,10 +16,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mambaloc.data import PoseDataModule
+from mambaloc.data.datasets.capture import COLUMNS
 from mambaloc.data.views import MixedSampler
-from mambaloc.errors import InputWarning
+from mambaloc.errors import InputError, InputWarning
 from mambaloc.rendering import embedded_room, embedded_walk, render, shots_of_sequences
 from mambaloc.rendering.scenes.layouts import write_7scenes
+from mambaloc.synthesis import gate
 from mambaloc.synthesis import views as making_views
 
 SIZE, SHORT_SIDE, CROP = (96, 72), 48, (40, 56)
@@ -74,7 +78,7 @@ def depth_files(root, sequence=1):
 def lines_of(make, **options) -> tuple[PoseDataModule, list[str]]:
     """A module whose training batches are ready, and what the user was told."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
+        warnings.simplefilter("default", InputWarning)
         data = make(**options)
         data.train_dataloader()
     return data, [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
@@ -267,3 +271,115 @@ def test_views_are_made_once_and_opened_after_that(make, tmp_path, monkeypatch):
     np.testing.assert_array_equal(second.views.images, first.views.images)
     assert second.describe() == first.describe()
     assert first.seconds > 0
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+def test_bad_depth_frames_are_named_and_left_out(make, room_with_depth, tmp_path):
+    root = copied(room_with_depth, tmp_path)
+    files = depth_files(root)
+    small, empty, thousandth, truncated = files[3], files[6], files[9], files[12]
+    cv2.imwrite(str(small), cv2.imread(str(small), cv2.IMREAD_UNCHANGED)[::2, ::2])
+    cv2.imwrite(str(empty), np.zeros((72, 96), np.uint16))
+    cv2.imwrite(str(thousandth), np.maximum(cv2.imread(str(thousandth), cv2.IMREAD_UNCHANGED) // 1000, 1))
+    truncated.write_bytes(truncated.read_bytes()[:-20])
+    data, lines = lines_of(make, root=root, cache_dir=str(tmp_path))
+    without = "Views are made without it."
+    assert sorted(lines) == sorted(
+        [
+            f"{small}: depth is not 96x72 as most depth frames are. {without}",
+            f"{empty}: depth has no measured pixel. {without}",
+            f"{thousandth}: depth is 0.00077 times that of most frames. {without}",
+            f"{truncated}: depth is no whole 16-bit PNG of one channel. {without}",
+        ]
+    )
+    assert data.describe()["views"]["depth_frames"] == TRAIN // 2 - 4
+    assert lines_of(make, root=root, cache_dir=str(tmp_path))[1] == lines  # said again where views are only opened
+
+
+@pytest.mark.parametrize("change", ["unit", "empty", "none", "few"])
+def test_depth_that_cannot_be_used_gives_way_to_the_pictures_unless_it_was_asked_for(
+    make, room_with_depth, tmp_path, change, monkeypatch
+):
+    root = copied(room_with_depth, tmp_path)
+    for number, file in enumerate(depth_files(root)):
+        if change == "unit":  # a thousandth; sixteen bits hold no thousandfold
+            cv2.imwrite(str(file), np.maximum(cv2.imread(str(file), cv2.IMREAD_UNCHANGED) // 1000, 1))
+        elif change == "empty":
+            cv2.imwrite(str(file), np.zeros((72, 96), np.uint16))
+        elif change == "none" or number % 2:
+            file.unlink()
+    expected = {
+        "unit": r"depth.png: depth of this and \d+ more of 20 frames disagrees with the poses. Check the unit",
+        "empty": r"depth.png: depth has no measured pixel, and no other depth frame can be used. Mend or remove them",
+        "none": "no training frame has depth. Set data.view_depth to pictures",
+        "few": "10 of 40 training frames have depth, too few",
+    }[change]
+    if change != "few":
+        with pytest.raises(InputError, match=expected):
+            make(root=root, cache_dir=str(tmp_path), view_depth="sensor").train_dataloader()
+    from mambaloc.data.views import depth
+
+    monkeypatch.setattr(depth, "depth_from_pictures", stop_here)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        make(root=root, cache_dir=str(tmp_path)).train_dataloader()
+    (line,) = [str(each.message) for each in caught]
+    assert re.search(expected, line) or change == "none"
+    assert line.endswith("pictures are searched. The training goes on without views.")
+
+
+def stop_here(*args, **options):
+    raise InputError("pictures are searched.")
+
+
+def test_poor_views_are_left_out_and_the_training_goes_on(make, tmp_path, monkeypatch):
+    monkeypatch.setattr(gate, "LEAST_CORRELATION", 0.99)
+    data, lines = lines_of(make, cache_dir=str(tmp_path), points_per_frame=8)
+    assert len(lines) == 1
+    assert "not worth training on. The training goes on without views." in lines[0]
+    described = data.describe()
+    assert (described["views"]["count"], described["views"]["share"]) == (0, 0)
+    assert described["points_source"] == {"train": "depth", "val": "depth"}  # not from what was found poor
+    rows = [row for batch in rows_of(data.train_dataloader()) for row in batch]
+    assert sorted(rows) == [*range(TRAIN)]
+    assert not [*tmp_path.rglob("views-*")]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"clip_length": 3}, "data.clip_length 3: data.views are single pictures"),
+        ({"views": -1}, "data.views -1: must be 0 or more"),
+        ({"view_depth": "lidar"}, "data.view_depth 'lidar': choose one of auto, sensor, pictures"),
+        ({"view_share": 1.0}, "data.view_share 1: must be 0 or more and less than 1"),
+        ({"batch_size": 1}, "data.batch_size 1: has no room for a frame and a view"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(make, options, message):
+    with pytest.raises(InputError) as caught:
+        make(**options).train_dataloader()
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+def test_assumed_camera_is_said_once(make, room_with_depth, tmp_path):
+    """An imported scene that does not know its camera, whose focal length is 0.9 of the width."""
+    root = copied(room_with_depth, tmp_path)
+    (root / "room" / "scene.json").write_text(json.dumps({"mambaloc_scene": 1, "unit": "metre"}))
+    lines = [",".join(COLUMNS)]
+    for image in sorted((root / "room").glob("*/*.color.png")):
+        pose = np.loadtxt(str(image).replace(".color.png", ".pose.txt"))
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        numbers = ",".join(f"{number:.9f}" for number in (*pose[:3, 3], w, x, y, z))
+        sequence = image.parent.name
+        split = {"seq-01": "train", "seq-02": "val", "seq-03": "test"}[sequence]
+        lines.append(f"{sequence}/{image.name},{sequence},,{numbers},colour,{split}")
+    (root / "room" / "frames.csv").write_text("\n".join(lines))
+    options = {"root": root, "cache_dir": str(tmp_path), "validation": "marked", "val_sequences": None}
+    data, said = lines_of(make, **options)
+    assert len(said) == 1
+    assert "does not say focal length and centre of camera 'colour'" in said[0]
+    assert said[0].endswith("A focal length of 0.87 of the pictures' longer side is assumed.")
+    assert data.describe()["views"]["depth_frames"] == TRAIN // 2

@@ -29,7 +29,7 @@ def test_depth_of_other_frames_is_named_and_left_out(walk, names):
     np.testing.assert_array_equal(kept.world_from_cam, np.delete(walk.world_from_cam, [10, 40], axis=0))
 
 
-@pytest.mark.parametrize("factor", [1000, 10, 0.1])
+@pytest.mark.parametrize("factor", [1000, 10, 0.1, 0.001])
 def test_depth_of_another_unit_is_refused_by_name(walk, names, factor):
     wrong = replace(walk, depth_m=walk.depth_m * np.float32(factor))
     with pytest.raises(

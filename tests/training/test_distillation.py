@@ -1,5 +1,7 @@
 """A tiny teacher and its student, on rendered frames."""
 
+from types import SimpleNamespace
+
 import lightning as L
 import pytest
 import torch
@@ -143,6 +145,13 @@ def test_kept_answers_are_those_of_the_centre_crops(teacher, scenes, tmp_path, m
     expected = torch.cat([answer(system.teacher, batch.image).feature for batch in trainer.datamodule.batches("train")])
     assert torch.equal(system.answers.feature, expected)
     assert torch.equal(system.answers.of(torch.tensor([3, 1])).feature, expected[[3, 1]])
+
+
+def test_kept_answers_and_views_exclude_each_other(teacher):
+    system = student_of(teacher, cache_teacher=True)
+    system.trainer = SimpleNamespace(datamodule=SimpleNamespace(hparams={"views": 4}))
+    with pytest.raises(InputError, match=r"model.cache_teacher: asks of frames alone, not of data.views"):
+        system.on_fit_start()
 
 
 # --- checkpoints -----------------------------------------------------------------------------------------------------

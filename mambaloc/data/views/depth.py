@@ -31,6 +31,7 @@ VIEW_DEPTHS: tuple[str, ...] = get_args(ViewDepth)
 
 _MOST_FRAMES = 400  # with depth, spread over the poses; more cost time and add little
 _ENOUGH_FRAMES = 20  # with depth; where there are fewer than twice as many frames, half of them
+_FAR_OFF = 30.0  # times: no place of one scene, but another unit
 _NAMED = 3  # files in a line
 _SEARCHED = "Depth is searched in the pictures."
 
@@ -79,7 +80,10 @@ def depth_of_frames(folder: Path, data: CachedFrames, how: ViewDepth, device: to
     elif rows:
         lines = [f"{folder}: {len(rows)} of {len(data.frames)} training frames have depth, too few. {_SEARCHED}"]
     intrinsics = data.intrinsics.double().cpu().numpy()
-    found = depth_from_pictures(data.images, intrinsics, poses_of(data.frames), device=device)
+    try:
+        found = depth_from_pictures(data.images, intrinsics, poses_of(data.frames), device=device)
+    except InputError as error:
+        raise InputError(" ".join([*lines, str(error)])) from None
     return FoundDepth("pictures", found, lines)
 
 
@@ -100,12 +104,15 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
     chosen = np.array(rows)[farthest_points(viewpoints(poses, spread_m(poses)), _MOST_FRAMES, first=0)]
     files = [depth_path(data.frames.image_paths[row]) for row in chosen]
     intrinsics, poses = data.intrinsics[chosen].double().cpu().numpy(), poses_of(data.frames.select(chosen))
-    found = read_all(folder, files, intrinsics, (data.images.shape[2], data.images.shape[3]))
-    kept = [row for row, depth_m in enumerate(found) if not isinstance(depth_m, str)]
-    rules = {file: rule for file, rule in zip(files, found, strict=True) if isinstance(rule, str)}
-    if not kept:
-        raise InputError(f"{files[0]}: {rules[files[0]]}, and no other depth frame can be used. Mend or remove them.")
-    depth_m = np.stack([found[row] for row in kept])
+    read = read_all(folder, files, intrinsics, (data.images.shape[2], data.images.shape[3]))
+    rules = {file: each for file, each in zip(files, read, strict=True) if isinstance(each, str)}
+    if len(rules) == len(files):
+        line = f"{files[0]}: depth {rules[files[0]]}, and no other depth frame can be used."
+        raise InputError(f"{line} Mend them, or set data.view_depth to pictures.")
+    known = {file: each for file, each in zip(files, read, strict=True) if not isinstance(each, str)}
+    rules |= of_another_unit(known)
+    kept = [row for row, file in enumerate(files) if file not in rules]
+    depth_m = np.stack([known[files[row]] for row in kept])
     source = PosedDepth(data.images[chosen[kept]], depth_m, intrinsics[kept], poses[kept])
     source, off = without_disagreeing(source, [str(files[row]) for row in kept])
     return FoundDepth("sensor", source, lines_of({**rules, **{Path(f): "disagrees with the poses" for f in off}}))
@@ -132,10 +139,22 @@ def read_all(
         is_unknown = np.isin(depth_mm, NO_DEPTH_MM)
         if is_unknown.all():
             return "has no measured pixel"
-        return carried_depth(np.where(is_unknown, np.nan, depth_mm / 1000), sensor, matrix, size)
+        depth_m = carried_depth(np.where(is_unknown, np.nan, depth_mm / 1000), sensor, matrix, size)
+        return depth_m if np.isfinite(depth_m).any() else "has no measured pixel in the picture"
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(read, files, intrinsics))
+
+
+def of_another_unit(known: Mapping[Path, NDArray[np.float32]]) -> dict[Path, str]:
+    """Depth frames whose median is far from most others', and the rule that each breaks."""
+    medians_m = {file: float(np.nanmedian(depth_m)) for file, depth_m in known.items()}
+    usual_m = np.median([*medians_m.values()])
+    return {
+        file: f"is {median_m / usual_m:.2g} times that of most frames"
+        for file, median_m in medians_m.items()
+        if not 1 / _FAR_OFF < median_m / usual_m < _FAR_OFF
+    }
 
 
 def usual_size(files: Iterable[Path]) -> tuple[int, int]:

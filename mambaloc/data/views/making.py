@@ -66,7 +66,7 @@ class SceneViews:
 
     Args:
         source: training frames with depth, which views are made from.
-        depth: where that is from.
+        kind: of their depth, ``sensor`` or ``pictures``.
         quality: of views at the poses of real frames.
         share: of views in a batch; 0 where they are not trained on.
         views: None where the share is 0.
@@ -74,17 +74,26 @@ class SceneViews:
     """
 
     source: PosedDepth
-    depth: str
+    kind: str
     quality: Quality
     share: float
     views: Views | None
     seconds: float
 
+    def summary(self) -> str:
+        """How many views there are, from what, and how good they are, in one line."""
+        count = 0 if self.views is None else len(self.views)
+        made_of = {"sensor": "depth frames", "pictures": "frames, whose depth was searched in the pictures"}
+        return (
+            f"{count} views of {len(self.source)} {made_of[self.kind]}; {self.quality.describe()}; "
+            f"made in {self.seconds:.0f} s"
+        )
+
     def describe(self) -> dict[str, Any]:
         """What a result says of them."""
         return {
             "count": 0 if self.views is None else len(self.views),
-            "depth": self.depth,
+            "depth": self.kind,
             "depth_frames": len(self.source),
             "correlation": round(self.quality.correlation, 4),
             "share": self.share,

@@ -1,0 +1,31 @@
+"""A contact sheet of the views that a run trains on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import lightning as L
+
+from mambaloc.viz.views import draw_views
+
+
+class ViewSheet(L.Callback):
+    """Draw synthetic views beside real frames to ``RUN/views.png``, where there are views.
+
+    Views that were found not worth training on are drawn, too: the sheet shows why.
+
+    Args:
+        enabled: whether to.
+    """
+
+    def __init__(self, enabled: bool = True) -> None:
+        self.enabled = enabled
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Draw, before the first step."""
+        made = trainer.datamodule.scene_views  # type: ignore[attr-defined]
+        if made is None or not self.enabled or trainer.fast_dev_run or not trainer.is_global_zero:  # type: ignore[attr-defined]
+            return
+        path = Path(trainer.default_root_dir) / "views.png"
+        draw_views(made.source, made.views, made.quality, path, f"{made.kind} depth of {len(made.source)} frames")
+        print(f"{path}: {made.summary()}", flush=True)
