@@ -191,12 +191,13 @@ def adjusted(path, folder):
     given, rng = sparse_map.key_poses.copy(), np.random.default_rng(2)
     given[:, :3, 3] += 0.05 * np.sin(given[:, :3, 3] + rng.normal(size=3))
     given[:, :3, :3] = Rotation.from_rotvec([0.0, 0.03, 0.01]).as_matrix() @ given[:, :3, :3]
-    drift = fit_drift(sparse_map.key_poses, given)
-    replace(sparse_map, lens=Lens(0.985, -0.04), drift=drift).save(folder / "adjusted.safetensors")
+    drift, nugget = fit_drift(sparse_map.key_poses, given)
+    replace(sparse_map, lens=Lens(0.985, -0.04), drift=drift, nugget=nugget).save(folder / "adjusted.safetensors")
     return folder / "adjusted.safetensors"
 
 
-def test_drift_is_pythons(map_of_den, tmp_path, node):
+@pytest.mark.parametrize("nugget", [1e-3, 1.0])
+def test_drift_is_pythons(map_of_den, nugget, tmp_path, node):
     sparse_map = SparseMap.load(adjusted(map_of_den, tmp_path))
     poses = sparse_map.key_poses[::5].copy()
     poses[:, :3, 3] += 0.2
@@ -204,8 +205,8 @@ def test_drift_is_pythons(map_of_den, tmp_path, node):
         [{"rotation": pose[:3, :3].ravel().tolist(), "position_m": pose[:3, 3].tolist()} for pose in each]
         for each in (sparse_map.key_poses, poses)
     ]
-    asked = {"keyPoses": told[0], "weights": sparse_map.drift.tolist(), "poses": told[1]}
-    drift = Drift(sparse_map.key_poses, sparse_map.drift)
+    asked = {"keyPoses": told[0], "weights": sparse_map.drift.tolist(), "nugget": nugget, "poses": told[1]}
+    drift = Drift(sparse_map.key_poses, sparse_map.drift, nugget)
     for matrix, found in zip(poses, json.loads(node(HERE / "drift.mjs", WEB, input=json.dumps(asked))), strict=True):
         pose = CameraPose(matrix[:3, :3], matrix[:3, 3])
         given, unsure = drift.to_given(pose)

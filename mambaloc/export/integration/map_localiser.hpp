@@ -445,7 +445,7 @@ class MapLocaliser {
     const double* m = move.ptr<double>();
     const cv::Matx33d rotation = pose.rotation * turned(cv::Vec3d(m[3], m[4], m[5]) * way);
     const cv::Vec3d shift = (way > 0 ? pose.rotation : rotation) * cv::Vec3d(m[0], m[1], m[2]);
-    const double unsure = std::max(1 + 1e-3 - cv::Mat(near * inverse_ * near.t()).at<double>(0), 0.0);
+    const double unsure = std::max(1 + nugget_ - cv::Mat(near * inverse_ * near.t()).at<double>(0), 0.0);
     cv::Matx66d axes = cv::Matx66d::zeros();
     for (int r = 0; r < 3; ++r) for (int c = 0; c < 3; ++c) axes(r, c) = axes(r + 3, c + 3) = pose.rotation(r, c);
     return {{rotation, pose.position_m + shift * way}, unsure * (axes * amplitude_ * axes.t())};
@@ -466,6 +466,7 @@ class MapLocaliser {
     const std::string kind = about["keypoints"];
     if (!kind.empty() && kind != "sift") throw std::runtime_error("map: has " + kind + " keypoints, this reads sift");
     least_inliers_ = int(about["least_inliers"]);
+    nugget_ = about["nugget"].empty() ? 1e-3 : double(about["nugget"]);
     const auto array = [&](const char* name, int type, int columns) {
       const cv::FileNode entry = json[name];
       if (entry.empty()) throw std::runtime_error(std::string("map: lacks ") + name);
@@ -517,7 +518,7 @@ class MapLocaliser {
     cv::Mat covariance(drift_.rows, drift_.rows, CV_64F);
     for (int a = 0; a < drift_.rows; ++a)
       for (int b = 0; b < drift_.rows; ++b)
-        covariance.at<double>(a, b) = kernel(drift_places_[a], drift_places_[b]) + (a == b ? 1e-3 : 0);
+        covariance.at<double>(a, b) = kernel(drift_places_[a], drift_places_[b]) + (a == b ? nugget_ : 0);
     inverse_ = covariance.inv(cv::DECOMP_CHOLESKY);
     amplitude_ = cv::Matx66d(cv::Mat(drift_.t() * covariance * drift_ / drift_.rows).ptr<double>());
   }
@@ -539,7 +540,7 @@ class MapLocaliser {
   cv::Matx33d intrinsics_;
   cv::Matx66d amplitude_;
   cv::Size size_;
-  double focal_ = 1, radial_ = 0, near_ = 0, unit_m_ = 0, drift_unit_m_ = 0;
+  double focal_ = 1, radial_ = 0, near_ = 0, unit_m_ = 0, drift_unit_m_ = 0, nugget_ = 0;
   int least_inliers_ = 0;
 };
 

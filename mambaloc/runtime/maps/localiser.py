@@ -106,7 +106,7 @@ class MapLocaliser:
         self._unit_m = spread_m(sparse_map.key_poses)
         self._viewpoints = viewpoints(sparse_map.key_poses, self._unit_m)
         drift = sparse_map.drift if len(sparse_map.drift) else np.zeros((len(sparse_map.key_poses), 6))
-        self.drift = Drift(sparse_map.key_poses[: len(drift)], drift)
+        self.drift = Drift(sparse_map.key_poses[: len(drift)], drift, sparse_map.nugget)
 
     def localise(
         self, image: Image, intrinsics: ArrayLike | None = None, prior: CameraPose | None = None
@@ -214,9 +214,8 @@ class MapLocaliser:
         np.copyto(similarity, -1, where=_square_distances(features.rays, projected[visible]) > radius**2)
         best, is_clear = unambiguous(similarity, _GUIDED_RATIO)
         rows = np.flatnonzero(is_clear & mutual(similarity, best))
-        found = similarity[rows, best[rows]]
-        rows, found = (each[distance(found) < _GUIDED_FARTHEST] for each in (rows, found))
-        return _Matches(rows, visible[best[rows]], found >= most[rows])
+        rows = rows[distance(similarity[rows, best[rows]]) < _GUIDED_FARTHEST]
+        return _Matches(rows, visible[best[rows]], similarity[rows, best[rows]] >= most[rows])
 
     def _seen_around(self, pose: CameraPose) -> NDArray[np.bool_]:
         """Which points one of the nearest key frames sees, (P,): what is hidden from there is not searched.
