@@ -18,9 +18,10 @@ from mambaloc.console import OptionParser, exits_cleanly, pinhole_matrix, quiete
 from mambaloc.errors import InputError
 from mambaloc.mapping import MapSettings
 from mambaloc.mapping.building import POINTS, describe_points
-from mambaloc.mapping.evaluating import Making, build_and_measure, measure, measure_saved, read_frames
+from mambaloc.mapping.evaluating import Making, build_and_measure, measure, measure_saved
 from mambaloc.mapping.growing import add_frames, remove_session
 from mambaloc.mapping.new_frames import read_new_frames
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import LEAST, recipe_of
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
 from mambaloc.viz.coverage import write_coverage

@@ -19,7 +19,7 @@ from mambaloc.console import OptionParser, exits_cleanly, quieten
 from mambaloc.data.points.depth import NO_DEPTH_MM, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.images import read_image, resized
 from mambaloc.mapping import PosedFrames
-from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
 from mambaloc.synthesis import (

@@ -2,7 +2,7 @@
 //
 //   mambaloc::MapLocaliser localiser(bytes);                   // of the file; throws std::exception
 //   auto found = localiser.localise(rgb, intrinsics, &prior);  // prior: the network's pose, or nullptr
-//   if (found.accepted || found.probability > 0.25) use(found); else use(network);  // 0.25: that the network is right
+//   if (found.accepted || found.probability > 0.1) use(found); else use(network);  // 0.1: that the network is right
 //
 // Poses are world_from_cam: metres; OpenCV camera axes (x right, y down, z forward). One object serves any thread.
 // Each step is that of mambaloc/runtime/maps in Python; INTEGRATION.md says how to check it with the bundle's frames.
@@ -69,7 +69,7 @@ class MapLocaliser {
 
   // For a bridge to another language: height x width x 3 bytes, R G B; fx, fy, cx, cy in its pixels, or nullptr for the
   // map's own camera; the network's pose as x y z qw qx qy qz, or nullptr. Returns the same 7 numbers, the inliers, and
-  // the covariance's 36; nothing where no pose is accepted, nor likelier to be right than the prior's, taken for 0.25; nor where the
+  // the covariance's 36; nothing where no pose is accepted, nor likelier to be right than the prior's, taken for 0.1; nor where the
   // map's own camera does not have the picture's shape.
   std::vector<double> localise(const uint8_t* rgb, int height, int width, const double* camera, const double* prior) const {
     if (!camera && std::abs(width * size_.height - height * size_.width) > std::max(size_.width, size_.height)) return {};
@@ -85,7 +85,7 @@ class MapLocaliser {
     }
     const cv::Mat picture(height, width, CV_8UC3, const_cast<uint8_t*>(rgb));
     const MapLocalisation found = localise(picture, k, prior ? &around : nullptr);
-    if (!found.accepted && !(prior && found.probability > 0.25)) return {};
+    if (!found.accepted && !(prior && found.probability > 0.1)) return {};
     cv::Vec3d turn;
     cv::Rodrigues(found.pose.rotation, turn);
     const double angle = cv::norm(turn), share = angle > 1e-12 ? std::sin(angle / 2) / angle : 0.5;
