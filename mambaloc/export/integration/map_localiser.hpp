@@ -240,8 +240,8 @@ class MapLocaliser {
         const double share = deviation(refine(again, theirs, where, finest)) / unit_m_;
         cv::Vec3d turn;
         cv::Rodrigues(start.rotation.t() * pose.rotation, turn);
-        const double evidence = -5.0 + 3.29 * std::log(double(cells.size()) + 0.5) - 0.45 * std::log(std::max(share, 1e-3)) -
-                                0.91 * std::log(cv::norm(turn) * 180 / CV_PI + 0.1);
+        const double evidence = -4.9 + 3.48 * std::log(double(cells.size()) + 0.5) - 0.34 * std::log(std::max(share, 1e-3)) -
+                                1.01 * std::log(cv::norm(turn) * 180 / CV_PI + 0.1);
         answer.probability = std::isfinite(share) ? 1 / (1 + std::exp(-evidence)) : 0;
       }
     }
