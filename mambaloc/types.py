@@ -74,7 +74,29 @@ def height_and_width(size: int | tuple[int, int]) -> tuple[int, int]:
     return (size, size) if isinstance(size, int) else (size[0], size[1])
 
 
-@dataclass  # not frozen, likewise
+@dataclass  # not frozen, as PoseBatch
+class CellPrediction:
+    """What each cell of a dense head's feature map says of an image; N cells, row after row.
+
+    Shape:
+        ``rays_cam`` (B, N, 3): unit directions of the cells' centres in the camera, known from its intrinsics.
+        ``rays_world`` (B, N, 3): in which direction of the world a cell looks, unit; or None.
+        ``position_m`` (B, N, 3): where a cell takes the camera's centre to be.
+        ``points_m`` (B, N, 3): the scene point that a cell sees, world frame; or None.
+        ``rotation_weights`` and ``position_weights`` (B, N): what each counts in the pose, of sum 1.
+        ``grid``: rows and columns; N is their product.
+    """
+
+    rays_cam: Tensor
+    rays_world: Tensor | None
+    position_m: Tensor
+    points_m: Tensor | None
+    rotation_weights: Tensor
+    position_weights: Tensor
+    grid: tuple[int, int]
+
+
+@dataclass  # not frozen, as PoseBatch
 class PosePrediction:
     """What a localiser says of a batch of images.
 
@@ -83,9 +105,11 @@ class PosePrediction:
         metrics normalise it, ``mambaloc.geometry.canonical`` makes it a unit quaternion with ``w >= 0``.
         ``log_quaternion`` (B, 3): what a system that regresses it said; ``quaternion`` is its exponential.
         ``auxiliary``: what auxiliary heads say while training.
+        ``cells``: what a dense head's cells say, out of which it solves the pose.
     """
 
     position_m: Tensor
     quaternion: Tensor
     log_quaternion: Tensor | None = None
     auxiliary: tuple[PosePrediction, ...] = ()
+    cells: CellPrediction | None = None

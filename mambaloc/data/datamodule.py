@@ -19,6 +19,7 @@ from mambaloc.data.frames import Frames, OnBadFrame, Split
 from mambaloc.data.scene import Scene
 from mambaloc.data.splits import Validation
 from mambaloc.errors import InputError
+from mambaloc.geometry import cropped_intrinsics
 from mambaloc.types import PoseBatch
 
 
@@ -119,6 +120,13 @@ class PoseDataModule(L.LightningDataModule):
     def train_position_m(self) -> Tensor:
         """Positions of the training frames, (N, 3)."""
         return self.scene.parts["train"].data.position_m
+
+    @property
+    def train_intrinsics(self) -> Tensor:
+        """Pinhole matrices of the training frames' centre crops, (N, 3, 3), in pixels."""
+        data = self.scene.parts["train"].data
+        top, left = ((side - crop) // 2 for side, crop in zip(data.images.shape[-2:], self.crop, strict=True))
+        return cropped_intrinsics(data.intrinsics, top, left)
 
     def listed_training_frames(self) -> Frames:
         """Read the whole training split's poses, without decoding an image.

@@ -1,6 +1,6 @@
 """Rotations, poses and cameras: torch only, conventions as in ``mambaloc.types``."""
 
-from mambaloc.geometry.cameras import cropped_intrinsics, project, resized_intrinsics
+from mambaloc.geometry.cameras import cropped_intrinsics, grid_rays, project, resized_intrinsics
 from mambaloc.geometry.homographies import rotation_homography, warped
 from mambaloc.geometry.poses import (
     compose,
@@ -23,12 +23,16 @@ from mambaloc.geometry.rotations import (
     rotate,
     rotation_error_deg,
 )
+from mambaloc.geometry.solving import align_directions, intersect_rays
 
 __all__ = [
+    "align_directions",
     "canonical",
     "compose",
     "conjugate",
     "cropped_intrinsics",
+    "grid_rays",
+    "intersect_rays",
     "inverse",
     "is_rotation",
     "log_from_quaternion",

@@ -46,3 +46,25 @@ def cropped_intrinsics(intrinsics: Tensor, top: Tensor | int, left: Tensor | int
     cropped[..., 0, 2] -= left
     cropped[..., 1, 2] -= top
     return cropped
+
+
+def grid_rays(intrinsics: Tensor, image_size: tuple[int, int], grid: tuple[int, int]) -> Tensor:
+    """Directions in which a camera sees the centres of a grid's cells, row after row.
+
+    Args:
+        intrinsics: (B, 3, 3), in pixels of the image.
+        image_size: its height and width.
+        grid: rows and columns, which divide the image evenly.
+
+    Returns:
+        (B, rows * columns, 3), unit, in camera coordinates.
+    """
+    y_px, x_px = (
+        (torch.arange(cells, dtype=intrinsics.dtype, device=intrinsics.device) + 0.5) * (side / cells) - 0.5
+        for side, cells in zip(image_size, grid, strict=True)
+    )
+    x_N, y_N = x_px.repeat(grid[0]), y_px.repeat_interleave(grid[1])
+    x = (x_N - intrinsics[:, 0, 2, None]) / intrinsics[:, 0, 0, None]
+    y = (y_N - intrinsics[:, 1, 2, None]) / intrinsics[:, 1, 1, None]
+    rays = torch.stack((x, y, torch.ones_like(x)), dim=-1)
+    return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)

@@ -7,6 +7,7 @@ from typing import Any
 from torch import nn
 
 from mambaloc.errors import InputError
+from mambaloc.losses.cells import CellWeights
 from mambaloc.losses.log_quaternion import LogQuaternionWeights, RelativeLogQuaternionWeights
 from mambaloc.losses.reprojection import Reprojection
 from mambaloc.losses.soft_targets import Soft, SoftTargets, cosine_distance, softened_kl
@@ -18,6 +19,7 @@ LOSSES: dict[str, type[nn.Module]] = {
     "log_quaternion": LogQuaternionWeights,
     "relative_log_quaternion": RelativeLogQuaternionWeights,
     "reprojection": Reprojection,
+    "cells": CellWeights,
 }
 
 
@@ -37,6 +39,7 @@ def build_loss(name: str, args: dict[str, Any] | None = None) -> nn.Module:
 
 __all__ = [
     "LOSSES",
+    "CellWeights",
     "FixedWeights",
     "LearnedWeights",
     "LogQuaternionWeights",

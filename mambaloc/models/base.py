@@ -106,7 +106,7 @@ class LitPoseRegressor(L.LightningModule):
         if compile_mode not in (None, *get_args(CompileMode)):
             raise InputError(f"model.compile_mode {compile_mode!r}: choose one of {', '.join(get_args(CompileMode))}")
         self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode
-        self._compiled: Callable[[Tensor], PosePrediction] | None = None
+        self._compiled: Callable[..., PosePrediction] | None = None
         self.val_errors, self.test_errors = PoseErrors(), PoseErrors()
         self.provenance: dict[str, Any] = {}
         self.save_hyperparameters()
@@ -132,9 +132,9 @@ class LitPoseRegressor(L.LightningModule):
         taken = set(inspect.signature(network).parameters) - {"backbone", "image_size"}
         return {name: value for name, value in self.hparams.items() if name in taken}
 
-    def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images, (B, 3, H, W) in 0..1."""
-        return self.network(image)
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> PosePrediction:
+        """Localise images, (B, 3, H, W) in 0..1, of cameras (B, 3, 3) in pixels of them."""
+        return self.network(image, intrinsics)
 
     def setup(self, stage: str) -> None:
         """Take the scene's position statistics, and compile what the epochs run, before the first epoch.
@@ -177,7 +177,7 @@ class LitPoseRegressor(L.LightningModule):
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
         """Return the loss of a batch; auxiliary heads weigh 0.3 each (Szegedy et al. 2015)."""
-        prediction = (self._compiled or self)(batch.image)
+        prediction = (self._compiled or self)(batch.image, batch.intrinsics)
         loss = self.loss(prediction, batch)
         for auxiliary in prediction.auxiliary:
             loss = loss + 0.3 * self.loss(auxiliary, batch)
@@ -191,17 +191,17 @@ class LitPoseRegressor(L.LightningModule):
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:
         """Collect a validation batch."""
-        prediction = self(batch.image)
+        prediction = self(batch.image, batch.intrinsics)
         self.val_errors.update(prediction, batch)
         self.log("val/loss", self.loss(prediction, batch), batch_size=len(batch.index), sync_dist=True)
 
     def test_step(self, batch: PoseBatch, batch_idx: int) -> None:
         """Collect a test batch."""
-        self.test_errors.update(self(batch.image), batch)
+        self.test_errors.update(self(batch.image, batch.intrinsics), batch)
 
     def predict_step(self, batch: PoseBatch, batch_idx: int) -> PosePrediction:
         """Localise a batch without looking at its true poses."""
-        return self(batch.image)
+        return self(batch.image, batch.intrinsics)
 
     def on_validation_epoch_end(self) -> None:
         """Log the medians and recalls over the whole validation set."""

@@ -1,13 +1,18 @@
 """Blocks that know no batch and no file."""
 
 from mambaloc.nn.backbone import Backbone, ImageBackbone, PooledBackbone
+from mambaloc.nn.cells import CellHead, CellPosition, CellRotation
 from mambaloc.nn.encoder import TokenEncoder
 from mambaloc.nn.gis import GISMode, GlobalInformationSelector, build_gis
-from mambaloc.nn.heads import PoseHead, PoseNetwork, PositionScale, RegressionHead, Rotation
+from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation
+from mambaloc.nn.network import PoseNetwork
 from mambaloc.nn.ssm import Discretisation, MambaMixer, selective_scan
 
 __all__ = [
     "Backbone",
+    "CellHead",
+    "CellPosition",
+    "CellRotation",
     "Discretisation",
     "GISMode",
     "GlobalInformationSelector",

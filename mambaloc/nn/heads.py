@@ -1,14 +1,13 @@
-"""What turns global features into poses: regression heads, the scene's position scale, and the networks they end."""
+"""What turns global features into poses: regression heads and the scene's position scale."""
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
 from mambaloc.geometry import quaternion_from_log
-from mambaloc.nn.backbone import ImageBackbone
 from mambaloc.types import PosePrediction
 
 Rotation = Literal["quaternion", "log_quaternion"]
@@ -94,49 +93,3 @@ class PoseHead(nn.Module):
         if self.is_log:
             return PosePrediction(position_m, quaternion_from_log(rotation), log_quaternion=rotation)
         return PosePrediction(position_m, rotation)
-
-
-class PoseNetwork(nn.Module):
-    """Base of every network: a backbone, a global feature for each branch, and the head that reads them.
-
-    :meth:`forward` runs :meth:`forward_backbone`, :meth:`features` and :meth:`forward_head`; callers that need
-    what lies between them call them one by one, and compute nothing twice.
-
-    Shape:
-        (B, 3, H, W) in 0..1 -> :class:`~mambaloc.types.PosePrediction`.
-    """
-
-    backbone: ImageBackbone
-    head: PoseHead
-    image_size: tuple[int, int] | None = None
-    """(height, width) that the network was built for; None takes any."""
-
-    def features(self, feats: Any) -> tuple[Tensor, Tensor]:
-        """Turn what the backbone returns into the position and orientation branches' global features, (B, D) each."""
-        raise NotImplementedError
-
-    def forward_backbone(self, image: Tensor) -> Any:
-        """Run the backbone alone; (B, 3, H, W) in 0..1 -> its feature (B, D) or its maps, a list of (B, C, H, W).
-
-        Raises:
-            ValueError: for images of another size than the network was built for.
-        """
-        if self.image_size is not None and image.shape[-2:] != torch.Size(self.image_size):
-            raise ValueError(f"images are {tuple(image.shape[-2:])}, the network was built for {self.image_size}")
-        return self.backbone(image)
-
-    def forward_features(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Turn images, (B, 3, H, W) in 0..1, into both branches' global features, (B, D) each."""
-        return self.features(self.forward_backbone(image))
-
-    def forward_head(self, branches: tuple[Tensor, Tensor]) -> PosePrediction:
-        """Turn both branches' global features into poses."""
-        return self.head(*branches)
-
-    def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images.
-
-        Raises:
-            ValueError: as :meth:`forward_backbone`.
-        """
-        return self.forward_head(self.forward_features(image))

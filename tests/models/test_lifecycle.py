@@ -61,7 +61,8 @@ def test_forward_is_its_parts_one_after_another(name, gis):
     network, image = small(name, gis).eval().network, frames().image
     expected = flat(network(image))
     branches = network.forward_features(image)
-    assert [feature.shape for feature in branches] == [(3, branches[0].shape[-1])] * 2
+    assert [feature.shape for feature in branches] == [branches[0].shape] * 2
+    assert (len(branches[0]), branches[0].ndim) == (3, 3 if network.takes_intrinsics else 2)
     assert torch.equal(flat(network.forward_head(branches)), expected)
     again = network.features(network.forward_backbone(image))
     assert all(torch.equal(*pair) for pair in zip(again, branches, strict=True))

@@ -1,0 +1,162 @@
+"""DenseLoc: every cell of the feature map says where it looks, and the pose is solved from all of them."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mambaloc.errors import InputError
+from mambaloc.geometry import grid_rays
+from mambaloc.models.base import LitPoseRegressor
+from mambaloc.models.registry import register_model
+from mambaloc.nn import (
+    Backbone,
+    CellHead,
+    CellPosition,
+    CellRotation,
+    Discretisation,
+    GISMode,
+    PoseHead,
+    PoseNetwork,
+    TokenEncoder,
+    build_gis,
+)
+from mambaloc.types import PosePrediction
+
+Head = Literal["dense", "token"]
+
+_USUAL_FOCAL = 0.87  # over the longer side, until a training's camera is known
+
+
+class DenseLoc(PoseNetwork):
+    """Cells at one stride, each with what coarser maps say about it, a transformer over them, and a dense head.
+
+    The camera enters only through the directions of the cells, so that a crop, a turned view or another lens is just
+    another pinhole matrix. Rays in place of a quaternion follow Cameras as Rays (Zhang et al. 2024).
+
+    Args:
+        backbone: feature maps; the cells are those of the first, finest one.
+        image_size: (height, width) in pixels; fixes the position tables.
+        dim: width of the encoder and of GIS.
+        encoder_layers: layers of the transformer over the cells.
+        heads: attention heads of each layer.
+        feedforward: hidden width of each layer's MLP.
+        head_hidden: hidden width of the heads; None for linear ones.
+        dropout: residual and MLP dropout of the encoder.
+        head: ``dense``; or ``token``, the ablation that answers once, from the transformer's token.
+        rotation: ``procrustes`` or ``quaternion``, see :class:`~mambaloc.nn.CellHead`.
+        position: ``votes`` or ``points``, likewise.
+        gis: ``gis``, ``classical`` or ``none``: each cell's, in each branch.
+        discretisation: of the state space: ``euler`` or ``zoh``.
+
+    Shape:
+        (B, 3, H, W) in 0..1, intrinsics (B, 3, 3) in pixels -> :class:`~mambaloc.types.PosePrediction`.
+    """
+
+    takes_intrinsics: ClassVar[bool] = True
+
+    default_intrinsics: Tensor
+    """(3, 3): those of the training cameras, which are used where none are given."""
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        image_size: tuple[int, int] = (224, 224),
+        dim: int = 192,
+        encoder_layers: int = 2,
+        heads: int = 6,
+        feedforward: int = 384,
+        head_hidden: int | None = None,
+        dropout: float = 0.0,
+        head: Head = "dense",
+        rotation: CellRotation = "procrustes",
+        position: CellPosition = "votes",
+        gis: GISMode = "none",
+        discretisation: Discretisation = "euler",
+    ) -> None:
+        super().__init__()
+        self.backbone, self.image_size, self.is_dense = backbone, image_size, head == "dense"
+        self.grid = backbone.grids(image_size)[0]
+        channels = sum(backbone.channels)
+        self.encoder = TokenEncoder(channels, self.grid, dim, encoder_layers, heads, feedforward, dropout)
+        self.position_gis = build_gis(gis, dim, discretisation)
+        self.orientation_gis = build_gis(gis, dim, discretisation)
+        self.head = CellHead(dim, rotation, position, head_hidden) if self.is_dense else PoseHead(dim)
+        self.register_buffer("default_intrinsics", _usual_camera(image_size))
+
+    def features(self, feats: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Turn the feature maps into both branches' features of each cell; (B, N, dim) each, N = 1 for a token."""
+        size = feats[0].shape[-2:]
+        maps = [feats[0], *(F.interpolate(each, size, mode="bilinear", align_corners=False) for each in feats[1:])]
+        maps_BCHW = torch.cat(maps, dim=1)
+        if not self.is_dense:
+            token_BD = self.encoder(maps_BCHW)
+            return self.position_gis(token_BD), self.orientation_gis(token_BD)
+        cells_BND = self.encoder.cells(maps_BCHW).flatten(2).mT
+        cells_MD = cells_BND.flatten(0, 1)
+        position, orientation = (
+            gis(cells_MD).unflatten(0, cells_BND.shape[:2]) for gis in (self.position_gis, self.orientation_gis)
+        )
+        return position, orientation
+
+    def forward_head(self, branches: tuple[Tensor, Tensor], intrinsics: Tensor | None = None) -> PosePrediction:
+        """Solve the pose of each image's cells."""
+        if not isinstance(self.head, CellHead):
+            return self.head(*branches)
+        if intrinsics is None:
+            intrinsics = self.default_intrinsics.expand(branches[0].shape[0], -1, -1)
+        assert self.image_size is not None
+        return self.head(*branches, grid_rays(intrinsics.float(), self.image_size, self.grid), self.grid)
+
+
+@register_model("denseloc")
+class LitDenseLoc(LitPoseRegressor):
+    """DenseLoc, trained on the error of the solved pose and of each cell, with learned weights.
+
+    The arguments are those of :class:`DenseLoc` and of :class:`~mambaloc.models.base.LitPoseRegressor`, and
+    ``strides``: those of the feature maps that a cell sees; the first is the cells'.
+    """
+
+    network: DenseLoc
+
+    def __init__(
+        self,
+        backbone: str = "mobilenetv2_100",
+        strides: tuple[int, ...] = (16, 32),
+        dim: int = 192,
+        encoder_layers: int = 2,
+        heads: int = 6,
+        feedforward: int = 384,
+        head_hidden: int | None = None,
+        dropout: float = 0.0,
+        head: Head = "dense",
+        rotation: CellRotation = "procrustes",
+        position: CellPosition = "votes",
+        loss: str = "cells",
+        **shared: Any,
+    ) -> None:
+        if head not in get_args(Head):
+            raise InputError(f"model.head {head!r}: choose one of {', '.join(get_args(Head))}")
+        if head == "token" and loss == "cells":
+            loss = "learned_weights"
+        super().__init__(backbone=backbone, loss=loss, **shared)
+
+    def configure_network(self) -> DenseLoc:
+        """Build the network from the hyperparameters."""
+        backbone = Backbone(strides=tuple(self.hparams["strides"]), **self.backbone_arguments)
+        return DenseLoc(backbone, self.image_size, **self.hyperparameters_of(DenseLoc))
+
+    def setup(self, stage: str) -> None:
+        """Take the training cameras' median besides: what an image without intrinsics is taken to be seen by."""
+        super().setup(stage)
+        if stage == "fit" and (data := getattr(self.trainer, "datamodule", None)) is not None:
+            self.network.default_intrinsics.copy_(data.train_intrinsics.median(dim=0).values)
+
+
+def _usual_camera(image_size: tuple[int, int]) -> Tensor:
+    height, width = image_size
+    focal_px = _USUAL_FOCAL * max(image_size)
+    return torch.tensor([[focal_px, 0.0, (width - 1) / 2], [0.0, focal_px, (height - 1) / 2], [0.0, 0.0, 1.0]])

@@ -1,0 +1,99 @@
+"""A dense head: every cell of the feature map answers, and the pose is solved from all of them."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mambaloc.geometry import align_directions, canonical, intersect_rays, matrix_from_quaternion
+from mambaloc.nn.heads import PositionScale, RegressionHead
+from mambaloc.types import CellPrediction, PosePrediction
+
+CellRotation = Literal["procrustes", "quaternion"]
+"""What a cell says of the rotation: the direction of the world in which it looks, or the camera's quaternion."""
+
+CellPosition = Literal["votes", "points"]
+"""What a cell says of the position: the camera's centre; or that, and the scene point that it sees."""
+
+_VOTES_WEIGHT = 0.05  # of the mean vote, beside rays through points whose weights sum to 1
+
+
+class CellHead(nn.Module):
+    """From a feature a cell and branch to a pose.
+
+    With ``procrustes`` each cell says in which direction of the world it looks, and the rotation is the one that turns
+    the cells' directions in the camera, known from its intrinsics, into these best. With ``votes`` the position is the
+    weighted mean of the cells' guesses. With ``points`` each also says the scene point that it sees, and the position
+    is where the rays through these points meet, with the mean vote as a weak prior. The weights are learned: a softmax
+    over cells a branch.
+
+    Args:
+        dim: width of both features.
+        rotation: ``procrustes`` or ``quaternion``, the ablation's weighted mean of quaternions.
+        position: ``votes`` or ``points``.
+        hidden: hidden width of each branch's MLP; None for a linear layer.
+
+    Shape:
+        (B, N, dim), (B, N, dim), (B, N, 3) unit directions of the cells in the camera, and their grid ->
+        :class:`~mambaloc.types.PosePrediction`.
+
+    Raises:
+        ValueError: for an unknown ``rotation`` or ``position``.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        rotation: CellRotation = "procrustes",
+        position: CellPosition = "votes",
+        hidden: int | None = None,
+    ) -> None:
+        super().__init__()
+        if rotation not in get_args(CellRotation):
+            raise ValueError(f"rotation is 'procrustes' or 'quaternion', not {rotation!r}")
+        if position not in get_args(CellPosition):
+            raise ValueError(f"position is 'votes' or 'points', not {position!r}")
+        self.is_procrustes, self.sees_points = rotation == "procrustes", position == "points"
+        self.rotation = RegressionHead(dim, hidden, (3 if self.is_procrustes else 4) + 1)
+        self.position = RegressionHead(dim, hidden, 3 + 1)
+        if self.sees_points:
+            self.points = RegressionHead(dim, hidden, 3 + 1)
+        self.position_scale = PositionScale()
+
+    def forward(
+        self, position_BND: Tensor, rotation_BND: Tensor, rays_cam: Tensor, grid: tuple[int, int]
+    ) -> PosePrediction:
+        """Solve the pose, in float32 even under autocast."""
+        rotation, rotation_weights = _said(self.rotation(rotation_BND))
+        votes, position_weights = _said(self.position(position_BND))
+        rays_world = None
+        if self.is_procrustes:
+            rays_world = F.normalize(rotation, dim=-1)
+            quaternion = align_directions(rays_cam, rays_world, rotation_weights)
+        else:
+            quaternion = canonical((rotation_weights[..., None] * canonical(rotation)).sum(dim=1))
+        position, points = (position_weights[..., None] * votes).sum(dim=1), None
+        if self.sees_points:
+            points, position_weights = _said(self.points(position_BND))
+            directions = (matrix_from_quaternion(quaternion)[:, None] * rays_cam[:, :, None, :]).sum(dim=-1)
+            position = intersect_rays(directions, points, position_weights, position, _VOTES_WEIGHT)
+        metres = self.position_scale
+        cells = CellPrediction(
+            rays_cam,
+            rays_world,
+            metres(votes),
+            None if points is None else metres(points),
+            rotation_weights,
+            position_weights,
+            grid,
+        )
+        return PosePrediction(metres(position), quaternion, cells=cells)
+
+
+def _said(outputs_BNO: Tensor) -> tuple[Tensor, Tensor]:
+    """Split what cells say into values, (B, N, O - 1), and weights that sum to 1, (B, N)."""
+    values, logits = outputs_BNO[..., :-1], outputs_BNO[..., -1]
+    return values, torch.softmax(logits, dim=-1)
