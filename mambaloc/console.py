@@ -9,7 +9,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterable
 from functools import wraps
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,14 @@ def _user_mistake(error: BaseException | None) -> InputError | None:
     while error is not None and not isinstance(error, InputError):
         error = error.__cause__ or error.__context__
     return error
+
+
+class OptionParser(argparse.ArgumentParser):
+    """Answers a wrong option in one line, without the page of usage, which ``--help`` shows."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what is wrong as an :class:`~mambaloc.errors.InputError`."""
+        raise InputError(f"{message.removeprefix('argument ')}; --help lists the options")
 
 
 def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:

@@ -90,7 +90,7 @@ def den(made_once):
 def map_of_den(made_once, den):
     """The file of a sparse map of the den's training frames."""
     from mambaloc.mapping import MapSettings, build_map
-    from mambaloc.mapping.evaluating import read_frames
+    from mambaloc.mapping.posed import read_frames
     from mambaloc.mapping.recipe import MapRecipe
     from mambaloc.runtime.maps import MAP_FILE
 

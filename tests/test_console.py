@@ -1,10 +1,11 @@
 import argparse
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from mambaloc.console import exits_cleanly, thread_count, whole_number
+from mambaloc.console import OptionParser, exits_cleanly, thread_count, whole_number
 from mambaloc.errors import InputError
 
 
@@ -26,6 +27,30 @@ def test_input_error_inside_a_librarys_error_is_found(capsys):
     with pytest.raises(SystemExit):
         tool(wrapper)
     assert capsys.readouterr().err == "error: a.txt: is empty; fill it\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--port", "x"], "--port: x: give a whole number of at least 1; --help lists the options"),
+        (["--port"], "--port: expected one argument; --help lists the options"),
+        (["--prot=1"], "unrecognized arguments: --prot=1; --help lists the options"),
+        (["part", "--size", "2.5"], "--size: 2.5: give a whole number of at least 1; --help lists the options"),
+    ],
+)
+def test_a_wrong_option_is_one_line_without_the_usage(argv, message):
+    parser = OptionParser()
+    parser.add_argument("--port", type=whole_number(1))
+    parser.add_subparsers().add_parser("part").add_argument("--size", type=whole_number(1))
+    with pytest.raises(InputError) as error:
+        parser.parse_args(argv)
+    assert str(error.value) == message
+
+
+def test_every_tool_answers_a_wrong_option_in_a_line():
+    tools = Path(__file__).parents[1] / "tools"
+    parsers = [path for path in tools.rglob("*.py") if "ArgumentParser(" in path.read_text()]
+    assert parsers == []
 
 
 def test_a_bug_keeps_its_traceback():

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mambaloc import benchmark, list_models, provenance
-from mambaloc.console import exits_cleanly, quieten, thread_count, whole_number
+from mambaloc.console import OptionParser, exits_cleanly, quieten, thread_count, whole_number
 from mambaloc.errors import InputError
 from mambaloc.models.registry import model_class
 from mambaloc.zoo.bundles import load_with_data
@@ -14,7 +14,7 @@ from mambaloc.zoo.bundles import load_with_data
 def main() -> None:
     """Measure and print."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parts = parser.add_subparsers(required=True)
     part = parts.add_parser("sizes", help="parameters of every system beside the paper's")
     part.set_defaults(call=lambda args: benchmark.print_sizes(benchmark.size_table()))

@@ -1,9 +1,8 @@
 """Localise in a browser: python tools/demo.py [BUNDLE] [--port 8000] [--lan] [--film VIDEO] [--out FOLDER]."""
 
-import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
 from mambaloc.demo import build_site, embedded_film, serve_page
 
 
@@ -11,9 +10,9 @@ from mambaloc.demo import build_site, embedded_film, serve_page
 def main() -> None:
     """Serve the page until Ctrl-C, or write it."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("bundle", nargs="?", type=Path, help="of tools/export.py; the embedded room's by default")
-    parser.add_argument("--port", type=int, default=8000, help="0 takes a free one")
+    parser.add_argument("--port", type=whole_number(0, 65535), default=8000, help="0 takes a free one")
     parser.add_argument("--lan", action="store_true", help="serve the local network by HTTPS, for a phone's camera")
     parser.add_argument("--film", type=Path, help="video for the page to play")
     parser.add_argument("--out", type=Path, help="write the page there, for any web server, and end")

@@ -1,16 +1,15 @@
 """Get a public dataset from its official address: ``python tools/download.py 7scenes heads``."""
 
-import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly
+from mambaloc.console import OptionParser, exits_cleanly
 from mambaloc.data.download import describe_sources, download
 
 
 @exits_cleanly
 def main() -> None:
     """Read the arguments, list or download."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("dataset", nargs="?", help="7scenes or cambridge; none lists what there is")
     parser.add_argument("scene", nargs="?", help="a scene's name, or all")
     parser.add_argument("--root", type=Path, help="folder that holds the scenes (default: data/<dataset>)")

@@ -1,9 +1,8 @@
 """Export for apps: python tools/export.py CHECKPOINT_OR_ZOO_NAME [--to onnx,fp16,int8,ort] [--target android]."""
 
-import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import OptionParser, exits_cleanly, quieten
 from mambaloc.errors import InputError
 from mambaloc.export import FORMATS, TARGETS, write_bundle
 from mambaloc.runtime.report import print_deviations
@@ -14,7 +13,7 @@ from mambaloc.zoo.bundles import load_with_data, map_of
 def main() -> None:
     """Write a bundle and say how far each model is from PyTorch."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("source", metavar="CHECKPOINT_OR_ZOO_NAME", help="RUN/checkpoints/best.ckpt, or ARCH.TAG")
     parser.add_argument("--to", default="onnx,fp16", help=f"of {', '.join(FORMATS)}, with commas")
     parser.add_argument("--target", default="android", choices=TARGETS, help="kind of app that INTEGRATION.md is about")

@@ -1,11 +1,10 @@
 """Make a scene of any capture: python tools/import_scene.py SOURCE --out SCENE [--format KIND]."""
 
-import argparse
 import shlex
 import sys
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly
+from mambaloc.console import OptionParser, exits_cleanly
 from mambaloc.errors import InputError
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import FORMATS
@@ -16,7 +15,7 @@ from mambaloc.importing.splits.selection import ASKED
 @exits_cleanly
 def main() -> None:
     """Import, and say what was found."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         description=__doc__, epilog="; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
     )
     parser.add_argument("source", type=Path, help="the capture: a folder, or the file that lists its poses")

@@ -1,9 +1,8 @@
 """Localise pictures: python tools/localize.py [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA [--filter causal|smooth]."""
 
-import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, pinhole_matrix, thread_count
+from mambaloc.console import OptionParser, exits_cleanly, pinhole_matrix, thread_count
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.video import FILTERS, follow
 
@@ -11,7 +10,7 @@ from mambaloc.runtime.video import FILTERS, follow
 @exits_cleanly
 def main() -> None:
     """Localise every frame and write a trajectory; Ctrl-C ends a camera's."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument(
         "model",
         nargs="?",

@@ -14,14 +14,15 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, pinhole_matrix, quieten
+from mambaloc.console import OptionParser, exits_cleanly, pinhole_matrix, quieten, whole_number
 from mambaloc.errors import InputError
 from mambaloc.mapping import MapSettings
 from mambaloc.mapping.building import POINTS, describe_points
-from mambaloc.mapping.evaluating import Making, build_and_measure, measure, measure_saved, read_frames
+from mambaloc.mapping.evaluating import Making, build_and_measure, measure, measure_saved
 from mambaloc.mapping.growing import add_frames, remove_session
 from mambaloc.mapping.new_frames import read_new_frames
-from mambaloc.mapping.recipe import recipe_of
+from mambaloc.mapping.posed import read_frames
+from mambaloc.mapping.recipe import LEAST, recipe_of
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
 from mambaloc.viz.coverage import write_coverage
 from mambaloc.viz.matches import write_points
@@ -32,9 +33,6 @@ def main(argv: list[str] | None = None) -> None:
     """Write map.safetensors, coverage.png, and what the map does on test frames."""
     quieten()
     args = _parser().parse_args(argv)
-    for option, least, value in (("frames", 2, args.frames), ("width", 32, args.width)):
-        if value is not None and value < least:
-            raise InputError(f"--{option} {value}: is less than {least}. Give more.")
     if (args.intrinsics is not None or args.name) and not args.add:
         raise InputError(f"--{'name' if args.name else 'intrinsics'}: is of what --add adds. Leave it out.")
     if args.source.suffix == Path(MAP_FILE).suffix or (args.source / MAP_FILE).is_file():
@@ -96,14 +94,20 @@ def _change(args: argparse.Namespace) -> None:
         print(measured.describe())
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> OptionParser:
     lines = (__doc__ or "").splitlines()
-    parser = argparse.ArgumentParser(description=lines[0], epilog=" ".join(lines[2:]))
+    parser = OptionParser(description=lines[0], epilog=" ".join(lines[2:]))
     parser.add_argument(
         "source", type=Path, metavar="RECIPE|SCENE|MAP", help="a YAML file, an imported scene's folder, or a map"
     )
-    parser.add_argument("--frames", type=int, help="key frames, of the training frames or of those added; 160")
-    parser.add_argument("--width", type=int, help="of the pictures in which keypoints are searched, in pixels")
+    parser.add_argument(
+        "--frames",
+        type=whole_number(LEAST["key_frames"]),
+        help="key frames, of the training frames or of those added; 160",
+    )
+    parser.add_argument(
+        "--width", type=whole_number(LEAST["width"]), help="of the pictures in which keypoints are searched, in pixels"
+    )
     parser.add_argument("--points", choices=POINTS, help="our own unless given, or those of an imported COLMAP model")
     parser.add_argument("--out", type=Path, help="folder to write to; a new map's is runs/NAME unless given")
     change = parser.add_mutually_exclusive_group()

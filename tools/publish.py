@@ -1,9 +1,8 @@
 """Release a model: python tools/publish.py CHECKPOINT --tag TAG [--zoo zoo]."""
 
-import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import OptionParser, exits_cleanly, quieten
 from mambaloc.zoo.publishing import publish
 
 
@@ -11,7 +10,7 @@ from mambaloc.zoo.publishing import publish
 def main() -> None:
     """Measure, write, read back, measure again."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--tag", required=True, help="of its name, ARCH.TAG")
     parser.add_argument("--zoo", type=Path, default=Path("zoo"), help="folder of released models")

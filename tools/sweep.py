@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import OptionParser, exits_cleanly, quieten
 from mambaloc.sweep import Store, print_plan, read_sweep, run_sweep
 
 
@@ -11,7 +11,7 @@ from mambaloc.sweep import Store, print_plan, read_sweep, run_sweep
 def main() -> None:
     """Run trials, or report what ended."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parts = parser.add_subparsers(required=True)
     part = parts.add_parser("run", help="train and evaluate every trial of a sweep that has not ended before")
     part.add_argument("sweep", type=Path, help="a file like those in recipes/sweeps/")

@@ -1,9 +1,8 @@
 """Replay a bundle's frames through its models: python tools/verify_bundle.py FOLDER [--threads N]. Needs no torch."""
 
-import argparse
 from pathlib import Path
 
-from mambaloc.console import exits_cleanly, thread_count
+from mambaloc.console import OptionParser, exits_cleanly, thread_count
 from mambaloc.errors import InputError
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.report import print_deviations
@@ -12,7 +11,7 @@ from mambaloc.runtime.report import print_deviations
 @exits_cleanly
 def main() -> None:
     """Print each model's deviation; exit with code 2 where one is larger than the bundle allows."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("bundle", type=Path)
     parser.add_argument("--threads", type=thread_count, help="that one image may use")
     args = parser.parse_args()

@@ -18,7 +18,7 @@ from mambaloc.errors import InputError, InputWarning
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.mapping import MapSettings, build_map
 from mambaloc.mapping.building import POINTS, describe_points
-from mambaloc.mapping.evaluating import with_cameras
+from mambaloc.mapping.posed import with_cameras
 from mambaloc.mapping.recipe import LEAST
 from mambaloc.runtime.maps import SparseMap
 

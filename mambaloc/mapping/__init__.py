@@ -1,4 +1,4 @@
-"""Sparse maps from posed frames; what reads datasets is in ``recipe`` and ``evaluating``."""
+"""Sparse maps from posed frames; what reads datasets is in ``posed``."""
 
 from mambaloc.mapping.building import MapSettings, PosedFrames, build_map
 

@@ -131,6 +131,7 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
     _check_enough(scene, structure, settings.least_inliers)
     most = settings.most_bytes // bytes_each(len(key))
     camera = features[0]
+    drift, nugget = fit_drift(structure.world_from_cam, key.world_from_cam)
     kept = most_useful(structure.seen, len(structure.points_m), most, camera.size[0] / camera.intrinsics[0, 0])
     return SparseMap(
         structure.points_m[kept].astype(np.float32),
@@ -143,7 +144,8 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
         scene,
         _digests(frames, tracks),
         structure.lens,
-        np.zeros((0, 6)) if tracks else fit_drift(structure.world_from_cam, key.world_from_cam),
+        np.zeros((0, 6)) if tracks else drift,
+        nugget,
     )
 
 

@@ -5,26 +5,24 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from mambaloc import provenance
 from mambaloc.console import progress
-from mambaloc.data.cameras import frame_intrinsics
-from mambaloc.data.datasets.capture import is_captured, read_rows
-from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
-from mambaloc.data.frames import BadFrames, Frames, Split
-from mambaloc.data.tracks import Tracks, read_tracks
 from mambaloc.files import sha256, whole_file, writing
 from mambaloc.images import Image, read_image
 from mambaloc.mapping.building import PosedFrames, build_map, describe_points
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.metrics import summarise_errors
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
@@ -32,7 +30,6 @@ from mambaloc.runtime.maps.radii import LEVEL
 from mambaloc.runtime.rotations import (
     matrix_from_quaternion,
     quaternion_from_matrix,
-    rigid_transforms,
     rotation_error_deg,
     rotation_vector_from_quaternion,
 )
@@ -89,28 +86,6 @@ class MapErrors:
         )
 
 
-def read_frames(recipe: MapRecipe, split: Split) -> PosedFrames:
-    """Read a split of a recipe's scene with its cameras.
-
-    Raises:
-        InputError: for a scene that cannot be read, or whose cameras are unknown.
-    """
-    dataset, root, scene = locate(recipe.dataset, recipe.root, recipe.scene)
-    folder = scene_folder(dataset, Path(root) if root else None, scene)
-    return with_cameras(dataset, folder, DATASETS[dataset].read_split(folder, split, BadFrames()))
-
-
-def with_cameras(dataset: str, folder: Path, frames: Frames) -> PosedFrames:
-    """Add the cameras to frames of a scene, and the points that it was imported with.
-
-    Raises:
-        InputError: where cameras are unknown, or the points' file is damaged.
-    """
-    intrinsics = frame_intrinsics(dataset, folder, frames)
-    poses = rigid_transforms(matrix_from_quaternion(frames.quaternion), frames.position_m)
-    return PosedFrames(frames.image_paths, intrinsics, poses, _tracks(folder, frames) if is_captured(folder) else None)
-
-
 def localise_frames(
     localiser: MapLocaliser,
     images: Sequence[Path | Image],
@@ -126,19 +101,31 @@ def localise_frames(
         priors: a pose to search around, of each picture that has one.
 
     Returns:
-        The answers, and the CPU seconds that each took on all cores, without decoding the picture, (N,).
+        The answers, and the seconds that each took on one core, without decoding the picture, (N,).
 
     Raises:
         InputError: for a bad picture.
     """
     found, cpu_s = [], []
     rows = zip(images, intrinsics, priors or [None] * len(images), strict=True)
-    for image, matrix, prior in progress(rows, "queries", len(images)):
-        rgb = read_image(image) if isinstance(image, Path) else image
-        start = time.process_time()
-        found.append(localiser.localise(rgb, matrix, prior))
-        cpu_s.append(time.process_time() - start)
+    with _on_one_core():
+        for image, matrix, prior in progress(rows, "queries", len(images)):
+            rgb = read_image(image) if isinstance(image, Path) else image
+            start = time.process_time()
+            found.append(localiser.localise(rgb, matrix, prior))
+            cpu_s.append(time.process_time() - start)
     return found, np.array(cpu_s)
+
+
+@contextmanager
+def _on_one_core() -> Iterator[None]:
+    """Keep OpenCV from sharing small pictures among threads, which takes more CPU time in all."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
 
 
 def measure(sparse_map: SparseMap, frames: PosedFrames, seeds: Sequence[int]) -> MapErrors:
@@ -218,8 +205,8 @@ def build_and_measure(recipe: MapRecipe, out: Path) -> MeasuredMap:
     Writes ``map.safetensors`` and ``metrics.json``.
 
     Raises:
-        InputError: as :func:`read_frames` and :func:`~mambaloc.mapping.building.build_map`, and for a folder that
-            cannot be written.
+        InputError: as :func:`~mambaloc.mapping.posed.read_frames` and
+            :func:`~mambaloc.mapping.building.build_map`, and for a folder that cannot be written.
     """
     train, test = read_frames(recipe, "train"), read_frames(recipe, "test")
     cpu = time.process_time()
@@ -285,10 +272,3 @@ def measure_saved(path: Path, recipe: MapRecipe, test: PosedFrames, making: Maki
     with writing(path.parent), whole_file(path.parent / "metrics.json") as partial:
         partial.write_text(json.dumps({**result, "metrics": finite}, indent=2) + "\n", encoding="utf-8")
     return MeasuredMap(sparse_map, test, errors, result)
-
-
-def _tracks(folder: Path, frames: Frames) -> Tracks | None:
-    """Points that the scene was imported with and these frames see."""
-    row_of = {row.image: number for number, row in enumerate(read_rows(folder))}
-    tracks = read_tracks(folder, len(row_of))
-    return tracks and tracks.of_frames(np.array([row_of[image] for image in frames.image_paths]))

@@ -212,7 +212,7 @@ def _moves(sparse_map: SparseMap) -> Floats:
     moves = np.full((len(sparse_map.key_poses), 6), np.nan)
     moves[: _first(sparse_map)] = 0  # of a map whose frame is its own
     if known := len(sparse_map.drift):
-        moves[:known] = known_moves(sparse_map.key_poses[:known], sparse_map.drift)
+        moves[:known] = known_moves(sparse_map.key_poses[:known], sparse_map.drift, sparse_map.nugget)
     return moves
 
 
@@ -223,7 +223,7 @@ def _drift(sparse_map: SparseMap, key_poses: Floats, moves: Floats) -> tuple[NDA
     known = 1 + int(np.flatnonzero(np.isfinite(moves[:, 0]))[-1])
     if known <= first:
         return alone, np.zeros((0, 6))
-    return drift_weights(key_poses[:known], moves[:known]), alone
+    return drift_weights(key_poses[:known], moves[:known], sparse_map.nugget), alone
 
 
 def _first(sparse_map: SparseMap) -> int:

@@ -14,8 +14,8 @@ from mambaloc.console import progress
 from mambaloc.data.datasets.capture import is_captured
 from mambaloc.errors import InputError
 from mambaloc.images import read_image
-from mambaloc.mapping.evaluating import read_frames
 from mambaloc.mapping.growing import NewFrame
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import recipe_of
 from mambaloc.runtime.maps import CameraPose, MapLocaliser
 from mambaloc.runtime.sources import frames_of

@@ -10,7 +10,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.export import write_bundle
 from mambaloc.mapping import MapSettings, build_map
-from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.runtime import contract

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.images import read_image
 from mambaloc.runtime.maps import MapLocaliser, SparseMap
-from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, refine_pose
+from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, pose_covariance, refine_pose
 from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, Evidence, is_another_focal_length
 from mambaloc.runtime.maps.drift import Drift, fit_drift
 from mambaloc.runtime.maps.lens import Lens
@@ -164,7 +164,8 @@ def test_ransac_finds_the_pose_among_outliers(solved):
 def test_refinement_is_pythons(solved):
     _, manies, answer = solved
     for (_, _, points, rays, start), found in zip(manies, answer["many"], strict=False):
-        pose, covariance = refine_pose(CameraPose(*start), points, rays, 0.02)
+        pose = refine_pose(CameraPose(*start), points, rays, 0.02)
+        covariance = pose_covariance(pose, points, rays, 0.02)
         np.testing.assert_allclose(found["refined"]["pose"]["position_m"], pose.position_m, atol=1e-6)
         np.testing.assert_allclose(np.reshape(found["refined"]["pose"]["rotation"], (3, 3)), pose.rotation, atol=1e-6)
         np.testing.assert_allclose(found["refined"]["covariance"], covariance, rtol=1e-3, atol=1e-9)
@@ -190,12 +191,13 @@ def adjusted(path, folder):
     given, rng = sparse_map.key_poses.copy(), np.random.default_rng(2)
     given[:, :3, 3] += 0.05 * np.sin(given[:, :3, 3] + rng.normal(size=3))
     given[:, :3, :3] = Rotation.from_rotvec([0.0, 0.03, 0.01]).as_matrix() @ given[:, :3, :3]
-    drift = fit_drift(sparse_map.key_poses, given)
-    replace(sparse_map, lens=Lens(0.985, -0.04), drift=drift).save(folder / "adjusted.safetensors")
+    drift, nugget = fit_drift(sparse_map.key_poses, given)
+    replace(sparse_map, lens=Lens(0.985, -0.04), drift=drift, nugget=nugget).save(folder / "adjusted.safetensors")
     return folder / "adjusted.safetensors"
 
 
-def test_drift_is_pythons(map_of_den, tmp_path, node):
+@pytest.mark.parametrize("nugget", [1e-3, 1.0])
+def test_drift_is_pythons(map_of_den, nugget, tmp_path, node):
     sparse_map = SparseMap.load(adjusted(map_of_den, tmp_path))
     poses = sparse_map.key_poses[::5].copy()
     poses[:, :3, 3] += 0.2
@@ -203,8 +205,8 @@ def test_drift_is_pythons(map_of_den, tmp_path, node):
         [{"rotation": pose[:3, :3].ravel().tolist(), "position_m": pose[:3, 3].tolist()} for pose in each]
         for each in (sparse_map.key_poses, poses)
     ]
-    asked = {"keyPoses": told[0], "weights": sparse_map.drift.tolist(), "poses": told[1]}
-    drift = Drift(sparse_map.key_poses, sparse_map.drift)
+    asked = {"keyPoses": told[0], "weights": sparse_map.drift.tolist(), "nugget": nugget, "poses": told[1]}
+    drift = Drift(sparse_map.key_poses, sparse_map.drift, nugget)
     for matrix, found in zip(poses, json.loads(node(HERE / "drift.mjs", WEB, input=json.dumps(asked))), strict=True):
         pose = CameraPose(matrix[:3, :3], matrix[:3, 3])
         given, unsure = drift.to_given(pose)

@@ -222,7 +222,7 @@ def test_native_apps_decide_as_python_does():
         *map(abs, (acceptance._CONSTANT, acceptance._PER_CELLS, acceptance._PER_DEVIATION, acceptance._PER_TURN)),
         *(acceptance._LEAST_DEVIATION, acceptance._LEAST_TURN_DEG),
         *(acceptance._FOCAL_OFF, acceptance._FOCAL_DEVIATIONS),
-        *(near_px(160), drift._LENGTH, drift._NUGGET, viewpoints._TURN_DEG, lens._STEPS),
+        *(near_px(160), drift._LENGTH, drift.NUGGET, viewpoints._TURN_DEG, lens._STEPS),
         *(absolute_pose._TRIALS, absolute_pose._CONFIDENCE, absolute_pose._STEPS),
         *(features._MOST_KEYPOINTS, features._CONTRAST, sparse_map.VERSION),
     }

@@ -26,7 +26,7 @@ from mambaloc.importing.capture import Camera
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import FORMATS, Format, read_capture
 from mambaloc.importing.undistort.pictures import selected, write_pictures
-from mambaloc.mapping.evaluating import with_cameras
+from mambaloc.mapping.posed import with_cameras
 from mambaloc.rendering import render
 
 TOOL = Path(__file__).parents[2] / "tools" / "import_scene.py"

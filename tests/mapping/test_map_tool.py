@@ -83,6 +83,19 @@ def test_a_missing_recipe_and_too_few_frames_are_refused(tmp_path):
         main([str(BLOCKS), "--frames", "1"])
 
 
+@pytest.mark.parametrize(
+    ("option", "least"),
+    [(["--frames", "x"], 2), (["--frames", "1"], 2), (["--width", "31"], 32), (["--width", "9.5"], 32)],
+)
+def test_a_wrong_number_is_refused_in_a_line(option, least, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main([str(BLOCKS), *option])
+    assert exit_.value.code == 2
+    name, value = option
+    expected = f"error: {name}: {value}: give a whole number of at least {least}; --help lists the options\n"
+    assert capsys.readouterr().err == expected
+
+
 def test_frames_without_a_pose_count_in_medians_and_shares_but_not_in_means():
     errors, covered = np.array([[0.01, 0.03, np.inf], [1.0, 2.0, np.inf]]), np.array([1, 0, 1], bool)
     lost = MapErrors(*errors, np.array([1, 1, 0], bool), covered, np.ones(3))

@@ -298,9 +298,16 @@ def test_wrong_label_is_kept_and_does_not_blow_up_the_room(tmp_path):
     assert cv2.imread(str(folder / shots[2].image)).std() > 12
 
 
-def test_tool_reports_a_mistake_in_one_line(tmp_path):
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--poses", "none.csv", "--scene", "den"],
+        ["--seed", "2"],  # of the embedded room, which would be written as it always is
+    ],
+)
+def test_tool_reports_a_mistake_in_one_line(options, tmp_path):
     tool = REPOSITORY / "tools" / "render_scene.py"
-    command = [sys.executable, str(tool), str(tmp_path), "--poses", str(tmp_path / "none.csv"), "--scene", "den"]
+    command = [sys.executable, str(tool), str(tmp_path), *options]
     done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")

@@ -42,7 +42,7 @@ FAMILIAR = replace(NETWORK, unfamiliarity=0.5)
         (FAMILIAR, (1 - 0.1**0.16) * (1 - 0.1 ** (25 / 81))),
         (replace(FAMILIAR, position_radius_m=0.2, rotation_radius_deg=5.0), 0.81),
         (replace(FAMILIAR, position_radius_m=0.02, rotation_radius_deg=0.5), 1.0),
-        (replace(FAMILIAR, position_radius_m=None, rotation_radius_deg=None), 0.25),
+        (replace(FAMILIAR, position_radius_m=None, rotation_radius_deg=None), 0.1),
     ],
     ids=["unfamiliar", "poor", "good", "excellent", "says nothing"],
 )

@@ -13,7 +13,7 @@ import mambaloc
 from mambaloc.cli import main
 from mambaloc.errors import InputError
 from mambaloc.mapping import MapSettings, build_map
-from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.models.mambaloc import LitMambaLoc
 from mambaloc.zoo import Manifest, list_released, load

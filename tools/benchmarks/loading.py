@@ -5,7 +5,6 @@ python tools/benchmarks/loading.py [--dataset NAME] [--root FOLDER] [--scene NAM
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from mambaloc import provenance
 from mambaloc.benchmark.reference import DecodedFrames
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import OptionParser, exits_cleanly, quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.memory import keep_freed_memory
 
@@ -42,7 +41,7 @@ class LoadingRates:
 def main() -> None:
     """Measure a scene and print."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     options = {"dataset": "embedded", "root": None, "scene": "heads", "augmentation": "crop"}
     for name, default in options.items():
         parser.add_argument(f"--{name}", default=default)

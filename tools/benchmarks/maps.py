@@ -16,7 +16,7 @@ from pathlib import Path
 
 from maps_report import by_disturbance, draw, overview, read_results
 
-from mambaloc.console import exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
 from mambaloc.mapping.recipe import MapRecipe, read_recipe
 
 
@@ -24,7 +24,7 @@ from mambaloc.mapping.recipe import MapRecipe, read_recipe
 def main() -> None:
     """Measure, print and write."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = OptionParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     names = ("robustness", "colmap", "acceptance", "report", "calibrate")
     robustness, colmap, acceptance, report, calibration = map(commands.add_parser, names)

@@ -20,7 +20,7 @@ from mambaloc.errors import InputError
 from mambaloc.files import writing
 from mambaloc.images import Image, read_image
 from mambaloc.mapping.building import MapSettings
-from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.maps import CameraPose, MapLocalisation, MapLocaliser
 from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, Evidence
@@ -36,6 +36,8 @@ _FIELDS = (
     "fold", "frame", "picture", "disturbance", "cells", "deviation", "turn_deg", "inliers", "accepted", "focal",
     "off_m", "off_deg", "pose_chi2", "position_chi2",
 )  # fmt: skip
+_THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99)
+_MOST_WRONG = 0.005
 _NAMES = [*DISTURBANCES, _RANDOM, "focal length x 0.9", "focal length x 1.1"]
 
 Floats = NDArray[np.float64]
@@ -122,9 +124,10 @@ def _scores(answer: MapLocalisation, evidence: Evidence, truth: Floats) -> tuple
 
 
 def calibrate(folders: Sequence[Path]) -> str:
-    """Fit the regression to what :func:`collect_evidence` wrote, and say what the fit and the rule as it is accept.
+    """Fit the regression to what :func:`collect_evidence` wrote, choose its threshold, and say what the rule accepts.
 
-    The fit is of all sequences but one for the answers to that one.
+    The threshold is chosen on other frames than the regression is fitted to: each sequence's probabilities are those of
+    a fit to all others.
 
     Raises:
         InputError: for a folder without evidence.
@@ -147,7 +150,7 @@ def calibrate(folders: Sequence[Path]) -> str:
     can = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
     probability = _left_out(known, is_wrong, says, is_asked, group)
     chosen = is_asked & _likeliest(pictures, probability)
-    lines.append(_shares("fitted to the others", chosen, can & (probability >= LEAST_PROBABILITY), is_wrong))
+    lines += _thresholds(chosen, np.where(can, probability, 0), is_wrong)
     probability = np.array([each.probability for each in evidence])
     is_final, accepted = _likeliest(pictures, probability), can & (probability >= LEAST_PROBABILITY)
     rows = {"the rule as it is": is_asked}
@@ -157,6 +160,17 @@ def calibrate(folders: Sequence[Path]) -> str:
     lines += _bins(probability[is_asked & is_final], of["off_m"][is_asked & is_final], is_wrong[is_asked & is_final])
     sure = (of["disturbance"] == 0) & accepted & is_final & ~is_wrong
     return "\n".join(lines + [_covered(folder.name, of, sure & (scene == n)) for n, folder in enumerate(folders)])
+
+
+def _thresholds(chosen: NDArray[np.bool_], probability: Floats, is_wrong: NDArray[np.bool_]) -> list[str]:
+    """What each threshold accepts, and the least of those that bound the share of wrong poses."""
+    lines, least = [], None
+    for threshold in _THRESHOLDS:
+        accepted = probability >= threshold
+        lines.append(_shares(f"fitted to others, {threshold:.2f}", chosen, accepted, is_wrong))
+        if least is None and is_wrong[chosen & accepted].mean() <= _MOST_WRONG:
+            least = threshold
+    return [*lines, f"the least threshold with at most {_MOST_WRONG:.1%} of accepted poses wrong: {least}"]
 
 
 def _left_out(

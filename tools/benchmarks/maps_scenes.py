@@ -16,7 +16,7 @@ from mambaloc.errors import InputError
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.files import writing
 from mambaloc.mapping.building import PosedFrames, build_map
-from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.models import Checkpoint
 from mambaloc.runtime import Localiser
@@ -83,7 +83,7 @@ def key_and_query(recipe: MapRecipe, hold_out: str | None) -> tuple[PosedFrames,
             decide anything, so that test frames are left for the end.
 
     Raises:
-        InputError: as :func:`~mambaloc.mapping.evaluating.read_frames`, and where no frame is in that folder.
+        InputError: as :func:`~mambaloc.mapping.posed.read_frames`, and where no frame is in that folder.
     """
     train = read_frames(recipe, "train")
     if hold_out is None:

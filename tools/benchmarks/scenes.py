@@ -5,7 +5,6 @@ python tools/benchmarks/scenes.py FOLDER [SCENE ...] [--dataset NAME] [--short-s
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from rich.progress import track
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process, peak_bytes
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.registry import DATASETS, scene_folder
 from mambaloc.data.frames import BadFrames, Split
@@ -68,7 +67,7 @@ class SceneCost:
 def main() -> None:
     """Measure scenes and print."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("root", type=Path, help="folder that holds them")
     parser.add_argument("scenes", nargs="*", help="names; every official one that is there unless given")
     parser.add_argument("--dataset", default="7scenes")

@@ -5,7 +5,6 @@ python tools/benchmarks/soak.py RECIPE.yaml [OVERLAY.yaml ...] [--steps N] [--ou
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from rich.console import Console
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import STATUS, said_of
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
 from mambaloc.errors import InputError
 from mambaloc.files import writing
 from mambaloc.viz.curves import COLORS, finish
@@ -68,9 +67,9 @@ class Sample:
 def main() -> None:
     """Train, print and draw."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("recipes", type=Path, nargs="+", help="a recipe, and overlays")
-    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("--steps", type=whole_number(1), default=10_000)
     parser.add_argument("--out", type=Path, default=Path("runs/soak"), help="folder that is not there yet")
     args = parser.parse_args()
     samples = measure_soak(args.recipes, args.steps, args.out)

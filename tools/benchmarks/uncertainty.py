@@ -3,14 +3,13 @@
 python tools/benchmarks/uncertainty.py CHECKPOINT ... [--elsewhere FOLDER] [--out FOLDER]
 """
 
-import argparse
 from pathlib import Path
 
 from uncertainty_methods import measure_certainty
 from uncertainty_report import print_certainty, write_certainty
 
 from mambaloc import provenance
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import OptionParser, exits_cleanly, quieten
 from mambaloc.zoo.bundles import load_with_data
 
 
@@ -18,7 +17,7 @@ from mambaloc.zoo.bundles import load_with_data
 def main() -> None:
     """Measure, print and write."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("checkpoints", nargs="+", help="of one scene; several are also taken for an ensemble")
     parser.add_argument("--elsewhere", type=Path, help="folder of pictures of another place")
     parser.add_argument("--out", type=Path, default=Path("runs/uncertainty"), help="folder of the plot and the figures")

@@ -6,7 +6,6 @@ python tools/benchmarks/views.py [--root FOLDER] [--scene NAME] [--map FILE] [--
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +15,11 @@ import numpy as np
 import torch
 
 from mambaloc import provenance
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import OptionParser, exits_cleanly, quieten
 from mambaloc.data.points.depth import NO_DEPTH_MM, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.images import read_image, resized
 from mambaloc.mapping import PosedFrames
-from mambaloc.mapping.evaluating import read_frames
+from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
 from mambaloc.synthesis import (
@@ -44,7 +43,7 @@ _VIEWS = 512
 def main() -> None:
     """Measure a scene, print, and draw a contact sheet for each kind of depth."""
     quieten()
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("--root", default="../shared/data/7scenes_blocks")
     parser.add_argument("--scene", default="redkitchen")
     parser.add_argument("--map", type=Path, help="of the training frames, whose adjusted poses and lens are used")

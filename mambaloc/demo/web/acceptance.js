@@ -2,7 +2,7 @@
 
 export const LEAST_PROBABILITY = 0.95;
 const CELLS = 4; // a side of the grid
-const [CONSTANT, PER_CELLS, PER_DEVIATION, PER_TURN] = [-5, 3.29, -0.45, -0.91];
+const [CONSTANT, PER_CELLS, PER_DEVIATION, PER_TURN] = [-4.9, 3.48, -0.34, -1.01];
 const [LEAST_DEVIATION, LEAST_TURN_DEG] = [1e-3, 0.1];
 const [FOCAL_OFF, FOCAL_DEVIATIONS] = [0.03, 3];
 

@@ -8,7 +8,7 @@ import { inverse, product, transposed } from "./vectors.js";
 import { spreadOf, squareBetween, viewpoint } from "./viewpoints.js";
 
 const LENGTH = 8; // of the kernel, in units of viewpoints
-const NUGGET = 1e-3; // variance of a single key frame's move, over that of the drift
+const NUGGET = 1e-3; // variance of a single key frame's move, over that of the drift, of maps that do not say it
 
 /** The drift of key frames: a Gaussian process over viewpoints. */
 export class Drift {
@@ -17,17 +17,20 @@ export class Drift {
   #weights;
   #inverse;
   #amplitude;
+  #nugget;
 
   /**
    * @param {object[]} keyPoses adjusted to the pictures.
    * @param {number[][]} weights six of each: of the shift in metres and the turn in radians along the camera's axes.
+   * @param {number} nugget with which they were fitted.
    */
-  constructor(keyPoses, weights) {
+  constructor(keyPoses, weights, nugget = NUGGET) {
     this.#unit_m = spreadOf(keyPoses);
     this.#places = keyPoses.map((pose) => viewpoint(pose, this.#unit_m));
     this.#weights = weights;
+    this.#nugget = nugget;
     const covariance = this.#places.map((place) => this.#near(place));
-    covariance.forEach((row, i) => (row[i] += NUGGET));
+    covariance.forEach((row, i) => (row[i] += nugget));
     this.#inverse = inverse(covariance);
     const squares = product(transposed(weights), product(covariance, weights));
     this.#amplitude = squares.map((row) => row.map((value) => value / weights.length)); // most likely
@@ -41,7 +44,7 @@ export class Drift {
     const near = [this.#near(viewpoint(pose, this.#unit_m))];
     const [[known]] = product(product(near, this.#inverse), transposed(near));
     const axes = axesOf(pose);
-    const share = Math.max(1 + NUGGET - known, 0);
+    const share = Math.max(1 + this.#nugget - known, 0);
     const unsure = product(product(axes, this.#amplitude), transposed(axes));
     return {
       pose: moved(pose, product(axes, transposed(product(near, this.#weights))).flat()),

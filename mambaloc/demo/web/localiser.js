@@ -8,7 +8,7 @@ import { Network } from "./network.js";
 
 const CONTRACT_VERSION = 1;
 const MODELS = ["model.onnx", "model.fp16.onnx", "model.int8.onnx", "model.ort"];
-const UNSTATED = 0.25; // probability that a network's pose is right which says nothing
+const UNSTATED = 0.1; // probability that a network's pose is right which says nothing
 const RIGHT = { m: 0.2, deg: 5 };
 const LEVEL_SIGMAS = 1.2815515655446004; // nine tenths of a normal variable are below
 

@@ -43,7 +43,7 @@ export class MapLocaliser {
     this.#unit_m = spreadOf(map.keyPoses);
     this.#viewpoints = map.keyPoses.map((pose) => viewpoint(pose, this.#unit_m));
     this.#matcher = new Matcher(map.descriptors, AT_ONCE);
-    this.#drift = map.drift.length ? new Drift(map.keyPoses, map.drift) : null;
+    this.#drift = map.drift.length ? new Drift(map.keyPoses, map.drift, map.about.nugget) : null;
   }
 
   /**

@@ -2,7 +2,7 @@
 //
 //   mambaloc::MapLocaliser localiser(bytes);                   // of the file; throws std::exception
 //   auto found = localiser.localise(rgb, intrinsics, &prior);  // prior: the network's pose, or nullptr
-//   if (found.accepted || found.probability > 0.25) use(found); else use(network);  // 0.25: that the network is right
+//   if (found.accepted || found.probability > 0.1) use(found); else use(network);  // 0.1: that the network is right
 //
 // Poses are world_from_cam: metres; OpenCV camera axes (x right, y down, z forward). One object serves any thread.
 // Each step is that of mambaloc/runtime/maps in Python; INTEGRATION.md says how to check it with the bundle's frames.
@@ -69,7 +69,7 @@ class MapLocaliser {
 
   // For a bridge to another language: height x width x 3 bytes, R G B; fx, fy, cx, cy in its pixels, or nullptr for the
   // map's own camera; the network's pose as x y z qw qx qy qz, or nullptr. Returns the same 7 numbers, the inliers, and
-  // the covariance's 36; nothing where no pose is accepted, nor likelier to be right than the prior's, taken for 0.25; nor where the
+  // the covariance's 36; nothing where no pose is accepted, nor likelier to be right than the prior's, taken for 0.1; nor where the
   // map's own camera does not have the picture's shape.
   std::vector<double> localise(const uint8_t* rgb, int height, int width, const double* camera, const double* prior) const {
     if (!camera && std::abs(width * size_.height - height * size_.width) > std::max(size_.width, size_.height)) return {};
@@ -85,7 +85,7 @@ class MapLocaliser {
     }
     const cv::Mat picture(height, width, CV_8UC3, const_cast<uint8_t*>(rgb));
     const MapLocalisation found = localise(picture, k, prior ? &around : nullptr);
-    if (!found.accepted && !(prior && found.probability > 0.25)) return {};
+    if (!found.accepted && !(prior && found.probability > 0.1)) return {};
     cv::Vec3d turn;
     cv::Rodrigues(found.pose.rotation, turn);
     const double angle = cv::norm(turn), share = angle > 1e-12 ? std::sin(angle / 2) / angle : 0.5;
@@ -240,8 +240,8 @@ class MapLocaliser {
         const double share = deviation(refine(again, theirs, where, finest)) / unit_m_;
         cv::Vec3d turn;
         cv::Rodrigues(start.rotation.t() * pose.rotation, turn);
-        const double evidence = -5.0 + 3.29 * std::log(double(cells.size()) + 0.5) - 0.45 * std::log(std::max(share, 1e-3)) -
-                                0.91 * std::log(cv::norm(turn) * 180 / CV_PI + 0.1);
+        const double evidence = -4.9 + 3.48 * std::log(double(cells.size()) + 0.5) - 0.34 * std::log(std::max(share, 1e-3)) -
+                                1.01 * std::log(cv::norm(turn) * 180 / CV_PI + 0.1);
         answer.probability = std::isfinite(share) ? 1 / (1 + std::exp(-evidence)) : 0;
       }
     }
@@ -445,7 +445,7 @@ class MapLocaliser {
     const double* m = move.ptr<double>();
     const cv::Matx33d rotation = pose.rotation * turned(cv::Vec3d(m[3], m[4], m[5]) * way);
     const cv::Vec3d shift = (way > 0 ? pose.rotation : rotation) * cv::Vec3d(m[0], m[1], m[2]);
-    const double unsure = std::max(1 + 1e-3 - cv::Mat(near * inverse_ * near.t()).at<double>(0), 0.0);
+    const double unsure = std::max(1 + nugget_ - cv::Mat(near * inverse_ * near.t()).at<double>(0), 0.0);
     cv::Matx66d axes = cv::Matx66d::zeros();
     for (int r = 0; r < 3; ++r) for (int c = 0; c < 3; ++c) axes(r, c) = axes(r + 3, c + 3) = pose.rotation(r, c);
     return {{rotation, pose.position_m + shift * way}, unsure * (axes * amplitude_ * axes.t())};
@@ -466,6 +466,7 @@ class MapLocaliser {
     const std::string kind = about["keypoints"];
     if (!kind.empty() && kind != "sift") throw std::runtime_error("map: has " + kind + " keypoints, this reads sift");
     least_inliers_ = int(about["least_inliers"]);
+    nugget_ = about["nugget"].empty() ? 1e-3 : double(about["nugget"]);
     const auto array = [&](const char* name, int type, int columns) {
       const cv::FileNode entry = json[name];
       if (entry.empty()) throw std::runtime_error(std::string("map: lacks ") + name);
@@ -517,7 +518,7 @@ class MapLocaliser {
     cv::Mat covariance(drift_.rows, drift_.rows, CV_64F);
     for (int a = 0; a < drift_.rows; ++a)
       for (int b = 0; b < drift_.rows; ++b)
-        covariance.at<double>(a, b) = kernel(drift_places_[a], drift_places_[b]) + (a == b ? 1e-3 : 0);
+        covariance.at<double>(a, b) = kernel(drift_places_[a], drift_places_[b]) + (a == b ? nugget_ : 0);
     inverse_ = covariance.inv(cv::DECOMP_CHOLESKY);
     amplitude_ = cv::Matx66d(cv::Mat(drift_.t() * covariance * drift_ / drift_.rows).ptr<double>());
   }
@@ -539,7 +540,7 @@ class MapLocaliser {
   cv::Matx33d intrinsics_;
   cv::Matx66d amplitude_;
   cv::Size size_;
-  double focal_ = 1, radial_ = 0, near_ = 0, unit_m_ = 0, drift_unit_m_ = 0;
+  double focal_ = 1, radial_ = 0, near_ = 0, unit_m_ = 0, drift_unit_m_ = 0, nugget_ = 0;
   int least_inliers_ = 0;
 };
 

@@ -16,6 +16,8 @@ Floats = NDArray[np.floating[Any]]
 _TRIALS = 1000
 _CONFIDENCE = 0.9999
 _STEPS = 10
+_CONVERGED = 1e-6  # of the cost
+_DIAGONAL = np.diag_indices(6)
 
 
 @dataclass(frozen=True)
@@ -67,36 +69,54 @@ def ransac_pose(points_m: Floats, rays: Floats, near: float, rng: np.random.Gene
     return CameraPose(cam_from_world.T, -cam_from_world.T @ shift[:, 0])
 
 
-def refine_pose(start: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[CameraPose, Floats]:
-    """Least squares of all matches with Cauchy's weights, by Levenberg-Marquardt, and the covariance of the solution.
+def refine_pose(start: CameraPose, points_m: Floats, rays: Floats, near: float) -> CameraPose:
+    """Least squares of all matches with Cauchy's weights, by Levenberg-Marquardt.
 
     Args:
         start: a pose from which the points lie in front.
         points_m: (M, 3), M of 4 or more.
         rays: (M, 2) in the plane at depth 1.
         near: a match that is off by half of it has half the weight.
-
-    Returns:
-        The pose, and its covariance (6, 6): of the position in metres, then of the rotation in radians about the fixed
-        axes of the world (``R = exp(θ) R_estimated``), as ROS's PoseWithCovariance has it; all infinite where a point
-        lies behind the camera. It is the sandwich of an M-estimator, ``H^-1 (Σ g g^T) H^-1`` of the cost's Hessian and
-        each match's gradient (Huber 1967): Cauchy's weights are not variances, so the inverse of the normal equations
-        is too small where residuals are as large as their scale.
     """
     pose, damping = start, 1e-4
     cost, normal, right = _normal_equations(pose, points_m, rays, near)
     for _ in range(_STEPS):
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6), right)
-        moved = _moved(pose, step)
+        damped = normal.copy()
+        damped[_DIAGONAL] += damping * normal[_DIAGONAL] + 1e-12
+        moved = _moved(pose, np.linalg.solve(damped, right))
         new = _normal_equations(moved, points_m, rays, near)
         if new[0] <= cost:
-            has_converged = cost - new[0] <= 1e-6 * cost
+            has_converged = cost - new[0] <= _CONVERGED * cost
             pose, damping, (cost, normal, right) = moved, damping / 10, new
             if has_converged:
                 break
         else:
             damping *= 10
-    return pose, _covariance(pose, points_m, rays, near)
+    return pose
+
+
+def pose_covariance(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> Floats:
+    """How sure a pose of :func:`refine_pose` is; points, rays and ``near`` are those that it was refined with.
+
+    Returns:
+        (6, 6), of the position in metres, then of the rotation in radians about the fixed axes of the world
+        (``R = exp(θ) R_estimated``), as ROS's PoseWithCovariance has it; all infinite where a point lies behind the
+        camera. It is the sandwich of an M-estimator, ``H^-1 (Σ g g^T) H^-1`` of the cost's Hessian and each match's
+        gradient (Huber 1967): Cauchy's weights are not variances, so the inverse of the normal equations is too small
+        where residuals are as large as their scale.
+    """
+    linear = _linearised(pose, points_m, rays, near)
+    if linear is None:
+        return np.full((6, 6), np.inf)
+    off, jacobian, _ = linear
+    weight = 1 / (1 + (off**2).sum(axis=0))
+    gradient = (jacobian * off).sum(axis=1) * weight
+    squares = gradient @ gradient.T
+    hessian = (jacobian * weight).reshape(6, -1) @ jacobian.reshape(6, -1).T - 2 * squares
+    inverse = np.linalg.pinv(hessian, hermitian=True)
+    freedom = off.size / max(off.size - 6, 1)
+    axes = np.kron(np.eye(2), pose.rotation) @ inverse
+    return np.asarray(freedom * axes @ squares @ axes.T)
 
 
 def focal_scale(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[float, float]:
@@ -115,34 +135,44 @@ def focal_scale(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -
     if linear is None:
         return 1.0, np.inf
     off, jacobian, seen = linear
-    jacobian = np.concatenate((jacobian, (seen * (2 / near))[..., None]), axis=2).reshape(-1, 7)
-    square = (off**2).sum(axis=1)
+    square = (off**2).sum(axis=0)
     weight = 1 / (1 + square)
-    weighted = (jacobian * np.repeat(weight, 2)[:, None]).T
-    inverse = np.linalg.pinv(weighted @ jacobian, hermitian=True)
-    variance = inverse[6, 6] * float(weight @ square) / max(2 * len(off) - 7, 1)
+    jacobian = np.concatenate((jacobian, (seen * (2 / near))[None]))
+    weighted = (jacobian * weight).reshape(7, -1)
+    inverse = np.linalg.pinv(weighted @ jacobian.reshape(7, -1).T, hermitian=True)
+    variance = inverse[6, 6] * float(weight @ square) / max(off.size - 7, 1)
     step = float(np.clip(-inverse[6] @ weighted @ off.ravel(), -1, 1))
     return float(np.exp(step)), float(np.sqrt(variance)) if variance > 0 else np.inf
 
 
 def _moved(pose: CameraPose, step: Floats) -> CameraPose:
-    return CameraPose(cv2.Rodrigues(step[3:])[0] @ pose.rotation, pose.position_m + step[:3])
+    """Shifted and turned along the camera's axes."""
+    return CameraPose(pose.rotation @ cv2.Rodrigues(step[3:])[0], pose.position_m + pose.rotation @ step[:3])
 
 
 def _linearised(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[Floats, Floats, Floats] | None:
-    """Residuals in halves of ``near`` (M, 2), their slopes (M, 2, 6), and where points are seen (M, 2).
+    """Residuals in halves of ``near`` (2, M), their slopes (6, 2, M) by steps of :func:`_moved`, and where points are
+    seen (2, M).
 
     None where a point lies behind the camera.
     """
-    towards = points_m - pose.position_m
-    cam = towards @ pose.rotation
-    if (cam[:, 2] <= 1e-9).any():
+    cam = pose.rotation.T @ (points_m - pose.position_m).T
+    if (cam[2] <= 1e-9).any():
         return None
-    seen = cam[:, :2] / cam[:, 2:]
-    # d seen / d cam, carried into the world; a turn by θ about the world's axes moves a point by -θ x towards.
-    slope = (pose.rotation.T[:2] - seen[..., None] * pose.rotation.T[2]) * (2 / near / cam[:, 2])[:, None, None]
-    jacobian = np.concatenate((-slope, slope @ (towards @ _CROSS).reshape(-1, 3, 3)), axis=-1)
-    return (seen - rays) * (2 / near), jacobian, seen
+    unit, seen = 2 / near, cam[:2] / cam[2]
+    shift = unit / cam[2]
+    (x, y), zero, product = seen, np.zeros(len(points_m)), unit * seen[0] * seen[1]
+    jacobian = np.array(
+        (
+            (-shift, zero),
+            (zero, -shift),
+            shift * seen,
+            (product, unit + unit * y**2),
+            (-unit - unit * x**2, -product),
+            (unit * y, -unit * x),
+        )
+    )
+    return (seen - rays.T) * unit, jacobian, seen
 
 
 def _normal_equations(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[float, Floats, Floats]:
@@ -150,25 +180,7 @@ def _normal_equations(pose: CameraPose, points_m: Floats, rays: Floats, near: fl
     linear = _linearised(pose, points_m, rays, near)
     if linear is None:
         return np.inf, np.eye(6), np.zeros(6)
-    off, jacobian = linear[0], linear[1].reshape(-1, 6)
-    square = (off**2).sum(axis=1)
-    weighted = (jacobian * np.repeat(1 / (1 + square), 2)[:, None]).T
-    return float(np.log1p(square).sum()), weighted @ jacobian, -weighted @ off.ravel()
-
-
-def _covariance(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> Floats:
-    linear = _linearised(pose, points_m, rays, near)
-    if linear is None:
-        return np.full((6, 6), np.inf)
     off, jacobian, _ = linear
-    weight = 1 / (1 + (off**2).sum(axis=1))
-    gradient = (jacobian * off[..., None]).sum(axis=1) * weight[:, None]
-    flat = jacobian.reshape(-1, 6)
-    hessian = (flat * np.repeat(weight, 2)[:, None]).T @ flat - 2 * gradient.T @ gradient
-    inverse = np.linalg.pinv(hessian, hermitian=True)
-    freedom = 2 * len(off) / max(2 * len(off) - 6, 1)
-    return np.asarray(freedom * inverse @ (gradient.T @ gradient) @ inverse)
-
-
-_CROSS = -np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
-"""``s @ (d @ _CROSS).reshape(3, 3)`` is ``s x d``."""
+    square = (off**2).sum(axis=0)
+    weighted = (jacobian / (1 + square)).reshape(6, -1)
+    return float(np.log1p(square).sum()), weighted @ jacobian.reshape(6, -1).T, -weighted @ off.ravel()

@@ -20,20 +20,26 @@ Floats = NDArray[np.floating[Any]]
 
 # Chosen on held-out blocks of a real room: longer is as good, shorter forgets the trend between distant key frames.
 _LENGTH = 8.0  # of the kernel, in units of viewpoints
-_NUGGET = 1e-3  # variance of a single key frame's move, over that of the drift
+NUGGET = 1e-3
+"""Variance of a single key frame's own move, over that of the drift, where poses drift as those of that room do."""
+_ONLY_NOISE = 1.0  # the same, of poses that hardly drift
 
 
-def fit_drift(adjusted: Floats, given: Floats) -> NDArray[np.float64]:
-    """Weights of key frames in the drift.
+def fit_drift(adjusted: Floats, given: Floats) -> tuple[NDArray[np.float64], float]:
+    """Weights of key frames in the drift, and the nugget with which their moves are likelier.
+
+    Where poses were given exactly, all moves are the adjustment's noise, and its variance must not be taken for drift.
 
     Args:
         adjusted: ``world_from_cam`` of key frames as they fit the pictures, (K, 4, 4).
         given: the same as they were given.
 
     Returns:
-        (K, 6): of shifts in metres and turns in radians, both along the camera's axes.
+        Weights (K, 6) of shifts in metres and turns in radians, both along the camera's axes; and the nugget.
     """
-    return drift_weights(adjusted, drift_moves(adjusted, given))
+    moves = drift_moves(adjusted, given)
+    nugget = max((NUGGET, _ONLY_NOISE), key=lambda each: _log_likelihood(adjusted, moves, each))
+    return drift_weights(adjusted, moves, nugget), float(nugget)
 
 
 def drift_moves(adjusted: Floats, given: Floats) -> NDArray[np.float64]:
@@ -44,17 +50,17 @@ def drift_moves(adjusted: Floats, given: Floats) -> NDArray[np.float64]:
     return np.hstack((shifts, turns))
 
 
-def drift_weights(adjusted: Floats, moves: Floats) -> NDArray[np.float64]:
+def drift_weights(adjusted: Floats, moves: Floats, nugget: float) -> NDArray[np.float64]:
     """Weights of key frames of which some moves (K, 6) are known; the others, NaN, weigh nothing."""
     known = np.flatnonzero(np.isfinite(moves[:, 0]))
     weights = np.zeros_like(moves)
-    weights[known] = np.linalg.solve(_covariance(adjusted)[np.ix_(known, known)], moves[known])
+    weights[known] = np.linalg.solve(_covariance(adjusted, nugget)[np.ix_(known, known)], moves[known])
     return np.asarray(weights, np.float64)
 
 
-def known_moves(adjusted: Floats, weights: Floats) -> NDArray[np.float64]:
+def known_moves(adjusted: Floats, weights: Floats, nugget: float) -> NDArray[np.float64]:
     """The inverse of :func:`drift_weights`, up to rounding."""
-    return np.asarray(np.where(weights.any(axis=1, keepdims=True), _covariance(adjusted) @ weights, np.nan))
+    return np.asarray(np.where(weights.any(axis=1, keepdims=True), _covariance(adjusted, nugget) @ weights, np.nan))
 
 
 class Drift:
@@ -63,13 +69,14 @@ class Drift:
     Args:
         key_poses: adjusted ``world_from_cam``, (K, 4, 4).
         weights: of :func:`fit_drift`, (K, 6).
+        nugget: with which they were fitted.
     """
 
-    def __init__(self, key_poses: Floats, weights: Floats) -> None:
+    def __init__(self, key_poses: Floats, weights: Floats, nugget: float) -> None:
         self._unit_m = spread_m(key_poses)
         self._places = viewpoints(key_poses, self._unit_m)
-        self._weights = weights
-        covariance = _covariance(key_poses)
+        self._weights, self._nugget = weights, nugget
+        covariance = _covariance(key_poses, nugget)
         self._inverse = np.linalg.inv(covariance)
         self._amplitude = weights.T @ covariance @ weights / len(weights)  # most likely, (6, 6)
 
@@ -84,7 +91,7 @@ class Drift:
         shift, turn = np.split(near @ self._weights, 2)
         carried = CameraPose(pose.rotation @ cv2.Rodrigues(turn)[0], pose.position_m + pose.rotation @ shift)
         axes = np.kron(np.eye(2), pose.rotation)
-        unsure = max(1 + _NUGGET - float(near @ self._inverse @ near), 0.0)
+        unsure = max(1 + self._nugget - float(near @ self._inverse @ near), 0.0)
         return carried, unsure * axes @ self._amplitude @ axes.T
 
     def to_adjusted(self, pose: CameraPose) -> CameraPose:
@@ -97,10 +104,18 @@ class Drift:
         return _kernel(viewpoints(pose.matrix[None], self._unit_m), self._places)[0]
 
 
-def _covariance(key_poses: Floats) -> Floats:
+def _log_likelihood(adjusted: Floats, moves: Floats, nugget: float) -> float:
+    """Of moves (K, 6), with the most likely variances of shifts and of turns, up to a constant."""
+    covariance = _covariance(adjusted, nugget)
+    squares = np.einsum("ki,ki->i", moves, np.linalg.solve(covariance, moves)).reshape(2, 3).sum(axis=1)
+    of_moves = 3 * len(moves) * np.log(np.maximum(squares, np.finfo(float).tiny)).sum()
+    return -0.5 * float(of_moves + 6 * np.linalg.slogdet(covariance)[1])
+
+
+def _covariance(key_poses: Floats, nugget: float) -> Floats:
     """Of the moves of key frames, over the variance of the drift, (K, K)."""
     places = viewpoints(key_poses, spread_m(key_poses))
-    return _kernel(places, places) + _NUGGET * np.eye(len(places))
+    return _kernel(places, places) + nugget * np.eye(len(places))
 
 
 def _kernel(places: Floats, others: Floats) -> Floats:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb
-from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, ransac_pose, refine_pose
+from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, pose_covariance, ransac_pose, refine_pose
 from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, Evidence, is_another_focal_length, occupied_cells
 from mambaloc.runtime.maps.drift import Drift
 from mambaloc.runtime.maps.features import (
@@ -97,14 +97,16 @@ class MapLocaliser:
         self.seed = seed
         self._points_m = sparse_map.points_m.astype(np.float64)
         self._descriptors = dequantized(sparse_map.descriptors)
-        self._views = sparse_map.is_seen
+        self._views = np.ascontiguousarray(sparse_map.is_seen.T)
         # A map's first points are in this order; those that were added to it are not.
-        self._often = np.argsort(-self._views.sum(axis=1), kind="stable")[:_AT_ONCE]
+        often = np.argsort(-self._views.sum(axis=0), kind="stable")[:_AT_ONCE]
+        self._often_m = self._points_m[often]
+        self._often_descriptors = np.ascontiguousarray(self._descriptors[often].T)
         self._near = near_px(sparse_map.size[0]) / sparse_map.intrinsics[0, 0]  # in the plane at depth 1
         self._unit_m = spread_m(sparse_map.key_poses)
         self._viewpoints = viewpoints(sparse_map.key_poses, self._unit_m)
         drift = sparse_map.drift if len(sparse_map.drift) else np.zeros((len(sparse_map.key_poses), 6))
-        self.drift = Drift(sparse_map.key_poses[: len(drift)], drift)
+        self.drift = Drift(sparse_map.key_poses[: len(drift)], drift, sparse_map.nugget)
 
     def localise(
         self, image: Image, intrinsics: ArrayLike | None = None, prior: CameraPose | None = None
@@ -133,9 +135,9 @@ class MapLocaliser:
 
     def localise_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalisation:
         """Localise a picture whose keypoints :meth:`features` found."""
-        best, is_clear = unambiguous(features.descriptors @ self._descriptors[self._often].T, _RATIO)
+        best, is_clear = unambiguous(features.descriptors @ self._often_descriptors, _RATIO)
         rng = np.random.default_rng(self.seed)
-        start = ransac_pose(self._points_m[self._often[best[is_clear]]], features.rays[is_clear], self._near, rng)
+        start = ransac_pose(self._often_m[best[is_clear]], features.rays[is_clear], self._near, rng)
         found = self._settled(features, start)
         if prior is None or found.is_accepted:
             return found
@@ -155,7 +157,7 @@ class MapLocaliser:
             if len(matches.points) < 4:
                 return _nowhere()
             seen_m, rays = self._points_m[matches.points], features.rays[matches.keypoints]
-            pose, covariance = refine_pose(pose, seen_m, rays, finest)
+            pose = refine_pose(pose, seen_m, rays, finest)
             off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
             scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
         is_inlier = off <= near
@@ -169,7 +171,7 @@ class MapLocaliser:
             quaternion_from_matrix(given.rotation),
             int(is_inlier.sum()),
             bool(probability >= LEAST_PROBABILITY and is_inlier.sum() >= self.map.least_inliers),
-            _SHARED * covariance + unsure,
+            _SHARED * pose_covariance(pose, seen_m, rays, finest) + unsure,
             probability,
             focal_off,
             evidence,
@@ -188,8 +190,9 @@ class MapLocaliser:
         points, keypoints = matches.points[matches.is_distinctive], matches.keypoints[matches.is_distinctive]
         deviation = np.inf
         if len(points) >= 4:
-            _, covariance = refine_pose(pose, self._points_m[points], features.rays[keypoints], scale)
-            deviation = _deviation_m(covariance) / self._unit_m
+            seen_m, rays = self._points_m[points], features.rays[keypoints]
+            alone = refine_pose(pose, seen_m, rays, scale)
+            deviation = _deviation_m(pose_covariance(alone, seen_m, rays, scale)) / self._unit_m
         pixels = features.pixels[matches.keypoints[matches.is_distinctive & is_inlier]]
         turn_deg = np.degrees(np.linalg.norm(cv2.Rodrigues(start.rotation.T @ pose.rotation)[0]))
         return Evidence(occupied_cells(pixels, features.size), deviation, float(turn_deg))
@@ -207,15 +210,12 @@ class MapLocaliser:
             inside = ((projected >= corners[0]) & (projected <= corners[1])).all(axis=1)
         visible = np.flatnonzero(inside & self._seen_around(pose))
         similarity = features.descriptors @ self._descriptors[visible].T
-        seen, at = (each.T.astype(np.float32) for each in (features.rays, projected[visible]))
-        x, y = (ours[:, None] - theirs for ours, theirs in zip(seen, at, strict=True))
-        nearby = np.where(x * x + y * y <= radius**2, similarity, np.float32(-1))
-        best, is_clear = unambiguous(nearby, _GUIDED_RATIO)
-        keep = is_clear & mutual(nearby, best)
-        rows = np.flatnonzero(keep)
-        rows = rows[distance(nearby[rows, best[rows]]) < _GUIDED_FARTHEST]
-        is_distinctive = nearby[rows, best[rows]] >= similarity[rows].max(axis=1, initial=-1)
-        return _Matches(rows, visible[best[rows]], is_distinctive)
+        most = similarity.max(axis=1, initial=-1)
+        np.copyto(similarity, -1, where=_square_distances(features.rays, projected[visible]) > radius**2)
+        best, is_clear = unambiguous(similarity, _GUIDED_RATIO)
+        rows = np.flatnonzero(is_clear & mutual(similarity, best))
+        rows = rows[distance(similarity[rows, best[rows]]) < _GUIDED_FARTHEST]
+        return _Matches(rows, visible[best[rows]], similarity[rows, best[rows]] >= most[rows])
 
     def _seen_around(self, pose: CameraPose) -> NDArray[np.bool_]:
         """Which points one of the nearest key frames sees, (P,): what is hidden from there is not searched.
@@ -224,14 +224,14 @@ class MapLocaliser:
         """
         apart = ((self._viewpoints - viewpoints(pose.matrix[None], self._unit_m)) ** 2).sum(axis=1)
         nearest = np.argsort(apart, kind="stable")[:_NEAREST]
-        return np.asarray(self._views[:, nearest].any(axis=1))
+        return np.asarray(self._views[nearest].any(axis=0))
 
     def _is_own_camera(self, features: Features) -> bool:
         """Whether a picture, of any resolution, claims to be of the map's camera, whose lens is known."""
         (width, height), most = self.map.size, 0.01 * self.map.size[0]
         as_large = rescaled_intrinsics(features.intrinsics, features.size, self.map.size)
         has_shape = abs(features.size[1] * width / features.size[0] - height) <= most
-        return has_shape and bool(np.allclose(as_large, self.map.intrinsics, rtol=0, atol=most))
+        return has_shape and bool(np.abs(as_large - self.map.intrinsics).max() <= most)
 
     def _intrinsics(self, image: Image) -> Floats:
         height, width = image.shape[:2]
@@ -249,6 +249,13 @@ def near_px(width: int) -> float:
     Poses of a real capture drift by that much; where matches agree better, the refinement follows them.
     """
     return 4.5 * width / 160
+
+
+def _square_distances(first: Floats, second: Floats) -> NDArray[np.float32]:
+    """Between points of a plane, (N, 2) and (M, 2); (N, M). As one product, without arrays of that size in between."""
+    of_first = np.column_stack((-2 * first, np.ones(len(first)), (first**2).sum(axis=1)))
+    of_second = np.column_stack((second, (second**2).sum(axis=1), np.ones(len(second))))
+    return np.asarray(of_first.astype(np.float32) @ of_second.astype(np.float32).T)
 
 
 def _deviation_m(covariance: Floats) -> float:

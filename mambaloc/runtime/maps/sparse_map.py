@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
 from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.runtime.maps.acceptance import RULE
+from mambaloc.runtime.maps.drift import NUGGET
 from mambaloc.runtime.maps.features import check_intrinsics
 from mambaloc.runtime.maps.lens import Lens
 
@@ -52,6 +54,7 @@ class SparseMap:
         drift: (K, 6), carries poses to the frame of the given ones, see
             :func:`~mambaloc.runtime.maps.drift.fit_drift`; (0, 6) where that is the map's own. Rows of 0 stand for
             key frames that came without a pose.
+        nugget: with which the drift was fitted.
         sessions: what was added later: how many key frames each has by its name, in the order of ``key_poses``, whose
             last they are.
         first_drift: ``drift`` before any key frame was added; (0, 6) where it has not changed since.
@@ -68,6 +71,7 @@ class SparseMap:
     digests: dict[str, str] = field(default_factory=dict)
     lens: Lens = field(default_factory=Lens)
     drift: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
+    nugget: float = NUGGET
     sessions: dict[str, int] = field(default_factory=dict)
     first_drift: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
 
@@ -88,8 +92,8 @@ class SparseMap:
         """Write it to a safetensors file, whole or not at all.
 
         The header's metadata hold one entry, ``about``: JSON with the format's version, the scene, the version of the
-        rule of acceptance and the inliers that this map asks for besides, digests, and a CRC-32 of the arrays in the
-        order of their names.
+        rule of acceptance and the inliers that this map asks for besides, the drift's nugget, digests, and a CRC-32 of
+        the arrays in the order of their names.
 
         Raises:
             InputError: where it cannot be written.
@@ -111,6 +115,7 @@ class SparseMap:
             "scene": self.scene,
             "least_inliers": self.least_inliers,
             "rule": RULE,
+            "nugget": self.nugget,
             "digests": self.digests,
             "sessions": self.sessions,
             "crc32": _crc32(arrays),
@@ -170,12 +175,14 @@ class SparseMap:
             raise ValueError("numbers are not finite")
         if not 0 < width <= LARGEST_SIDE_PX or not 0 < height <= LARGEST_SIDE_PX:
             raise ValueError(f"pictures of {width}x{height}")
+        if not 0 < (nugget := float(about.get("nugget", NUGGET))) < math.inf:
+            raise ValueError(f"nugget of {nugget}")
         check_intrinsics(arrays["intrinsics"], (width, height))
         return cls(
             points, arrays["descriptors"], arrays["views"], key_poses, (width, height), arrays["intrinsics"],
             int(about["least_inliers"]), str(about["scene"]),
             {str(name): str(digest) for name, digest in dict(about["digests"]).items()},
-            Lens(*map(float, arrays["lens"])), arrays["drift"], sessions, arrays["first_drift"],
+            Lens(*map(float, arrays["lens"])), arrays["drift"], nugget, sessions, arrays["first_drift"],
         )  # fmt: skip
 
 

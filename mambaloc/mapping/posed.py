@@ -1,0 +1,45 @@
+"""Frames of a scene with their cameras, to build maps from and to measure these on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mambaloc.data.cameras import frame_intrinsics
+from mambaloc.data.datasets.capture import is_captured, read_rows
+from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
+from mambaloc.data.frames import BadFrames, Frames, Split
+from mambaloc.data.tracks import Tracks, read_tracks
+from mambaloc.mapping.building import PosedFrames
+from mambaloc.mapping.recipe import MapRecipe
+from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
+
+
+def read_frames(recipe: MapRecipe, split: Split) -> PosedFrames:
+    """Read a split of a recipe's scene with its cameras.
+
+    Raises:
+        InputError: for a scene that cannot be read, or whose cameras are unknown.
+    """
+    dataset, root, scene = locate(recipe.dataset, recipe.root, recipe.scene)
+    folder = scene_folder(dataset, Path(root) if root else None, scene)
+    return with_cameras(dataset, folder, DATASETS[dataset].read_split(folder, split, BadFrames()))
+
+
+def with_cameras(dataset: str, folder: Path, frames: Frames) -> PosedFrames:
+    """Add the cameras to frames of a scene, and the points that it was imported with.
+
+    Raises:
+        InputError: where cameras are unknown, or the points' file is damaged.
+    """
+    intrinsics = frame_intrinsics(dataset, folder, frames)
+    poses = rigid_transforms(matrix_from_quaternion(frames.quaternion), frames.position_m)
+    return PosedFrames(frames.image_paths, intrinsics, poses, _tracks(folder, frames) if is_captured(folder) else None)
+
+
+def _tracks(folder: Path, frames: Frames) -> Tracks | None:
+    """Points that the scene was imported with and these frames see."""
+    row_of = {row.image: number for number, row in enumerate(read_rows(folder))}
+    tracks = read_tracks(folder, len(row_of))
+    return tracks and tracks.of_frames(np.array([row_of[image] for image in frames.image_paths]))
