@@ -352,7 +352,7 @@ def test_export_keeps_the_batch_dynamic():
 
 
 def test_package_exports_every_public_function():
-    modules = (geometry.cameras, geometry.homographies, geometry.poses, geometry.rotations)
+    modules = (geometry.cameras, geometry.homographies, geometry.poses, geometry.rotations, geometry.solving)
     public = {
         name
         for module in modules
