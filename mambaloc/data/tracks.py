@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save_file
 
+from mambaloc.data.datasets.capture import read_rows
+from mambaloc.data.frames import Frames
 from mambaloc.errors import InputError
 
 POINTS_FILE = "points.safetensors"
@@ -77,6 +79,17 @@ def read_tracks(folder: Path, frames: int) -> Tracks | None:
     except (OSError, ValueError, KeyError, SafetensorError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: is damaged ({reason[:200]}). Import the scene again, or remove the file.") from None
+
+
+def tracks_of_frames(folder: Path, frames: Frames) -> Tracks | None:
+    """Points that some frames of an imported scene see, numbered in the order of ``frames``; None where it has none.
+
+    Raises:
+        InputError: as :func:`read_tracks`.
+    """
+    row_of = {row.image: number for number, row in enumerate(read_rows(folder))}
+    tracks = read_tracks(folder, len(row_of))
+    return tracks and tracks.of_frames(np.array([row_of[image] for image in frames.image_paths]))
 
 
 def _check(arrays: dict[str, Any], frames: int) -> None:

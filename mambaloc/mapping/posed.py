@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from mambaloc.data.cameras import frame_intrinsics
-from mambaloc.data.datasets.capture import is_captured, read_rows
+from mambaloc.data.datasets.capture import is_captured
 from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, Split
-from mambaloc.data.tracks import Tracks, read_tracks
+from mambaloc.data.tracks import tracks_of_frames
 from mambaloc.mapping.building import PosedFrames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
@@ -35,11 +33,6 @@ def with_cameras(dataset: str, folder: Path, frames: Frames) -> PosedFrames:
     """
     intrinsics = frame_intrinsics(dataset, folder, frames)
     poses = rigid_transforms(matrix_from_quaternion(frames.quaternion), frames.position_m)
-    return PosedFrames(frames.image_paths, intrinsics, poses, _tracks(folder, frames) if is_captured(folder) else None)
-
-
-def _tracks(folder: Path, frames: Frames) -> Tracks | None:
-    """Points that the scene was imported with and these frames see."""
-    row_of = {row.image: number for number, row in enumerate(read_rows(folder))}
-    tracks = read_tracks(folder, len(row_of))
-    return tracks and tracks.of_frames(np.array([row_of[image] for image in frames.image_paths]))
+    return PosedFrames(
+        frames.image_paths, intrinsics, poses, tracks_of_frames(folder, frames) if is_captured(folder) else None
+    )

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from mambaloc.data.datasets.capture import COLUMNS, FRAMES_FILE
+from mambaloc.data.frames import Frames
+from mambaloc.data.points.tracks import read_track_points
 from mambaloc.data.tracks import POINTS_FILE, Tracks, read_tracks
 from mambaloc.errors import InputError
 
@@ -61,3 +64,16 @@ def test_a_cut_file_is_damaged(tracks, tmp_path):
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(InputError, match=r"is damaged"):
         read_tracks(tmp_path, 4)
+
+
+def test_frames_get_the_points_that_they_observe(tracks, tmp_path):
+    """Frames 3 and 1 of four, in that order: points 2 and 1; frame 3 and another have one each."""
+    rows = [f"{row}.png,walk,,0,0,0,1,0,0,0,lens,train" for row in range(4)]
+    (tmp_path / FRAMES_FILE).write_text("\n".join([",".join(COLUMNS), *rows]))
+    tracks.write(tmp_path)
+    images = tuple(tmp_path / f"{row}.png" for row in (3, 1))
+    frames = Frames(images, ("walk", "walk"), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    points = read_track_points(tmp_path, frames, 3, seed=0)
+    assert points.source == "tracks"
+    assert points.per_frame().tolist() == [1, 1]
+    assert points.points_m[:, 0].tolist() == [[6, 7, 8], [3, 4, 5]]

@@ -383,3 +383,20 @@ def test_assumed_camera_is_said_once(make, room_with_depth, tmp_path):
     assert "does not say focal length and centre of camera 'colour'" in said[0]
     assert said[0].endswith("A focal length of 0.87 of the pictures' longer side is assumed.")
     assert data.describe()["views"]["depth_frames"] == TRAIN // 2
+
+
+def test_where_views_and_points_cannot_be_had_the_training_goes_on_without_both(make, room_with_depth, tmp_path):
+    """Pictures of grey, without depth: nothing can be searched in them."""
+    root = copied(room_with_depth, tmp_path)
+    for file in depth_files(root) + depth_files(root, 2):
+        file.unlink()
+    for image in (root / "room").glob("*/*.color.png"):
+        cv2.imwrite(str(image), np.full((SIZE[1], SIZE[0], 3), 128, np.uint8))
+    data, said = lines_of(make, root=root, cache_dir=str(tmp_path), points_per_frame=16)
+    without_views, without_points = said[-2:]
+    assert without_views.endswith("The training goes on without views.")
+    assert "has no scene points for data.points_per_frame" in without_points
+    assert without_points.endswith("The training goes on without points.")
+    batch = next(iter(data.train_dataloader()))
+    assert batch.points_m is None
+    assert len(batch.index) == 8

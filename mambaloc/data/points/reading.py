@@ -1,4 +1,4 @@
-"""Find what a scene knows of its points: depth frames, an NVM model, a COLMAP model, in this order."""
+"""Find a scene's points: in depth frames, an NVM model, a COLMAP model, or tracks of an import, in this order."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from mambaloc.data.points.colmap import read_colmap_points
 from mambaloc.data.points.depth import depth_path, depth_rows, read_depth_points
 from mambaloc.data.points.nvm import read_nvm_points
 from mambaloc.data.points.scene_points import ScenePoints
+from mambaloc.data.points.tracks import read_track_points
+from mambaloc.data.tracks import POINTS_FILE
 from mambaloc.errors import InputError
 
 
@@ -36,11 +38,13 @@ def read_points(folder: Path, frames: Frames, cameras: Cameras, count: int, seed
         points = read_nvm_points(folder, frames, count, seed)
     elif colmap_folder(folder):
         points = read_colmap_points(folder, frames, count, seed)
+    elif (folder / POINTS_FILE).is_file():
+        points = read_track_points(folder, frames, count, seed)
     else:
         raise InputError(
             f"{folder}: has no scene points for data.points_per_frame: no depth frame such as "
             f"{depth_path(frames.image_paths[0]).relative_to(folder)}, no {NVM_FILE}, no COLMAP model in "
-            f"{' or '.join(COLMAP_FOLDERS)}; add one of them, or choose a model that needs no points"
+            f"{' or '.join(COLMAP_FOLDERS)}; add one of them, or set data.points_per_frame to 0"
         )
     if not points.per_frame().any():
         raise InputError(

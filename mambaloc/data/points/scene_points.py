@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Source = Literal["depth", "nvm", "colmap", "views"]
+Source = Literal["depth", "nvm", "colmap", "tracks", "views"]
 Points = NDArray[np.float64]
 
 
