@@ -181,13 +181,6 @@ class Scene:
             points = points_of_views(views, self.points_per_frame, provenance.seed()) if splatter else None
             self._mixed = FramesAndViews(self.parts["train"].data, views, made.share, points)
 
-    def _take_other_points(self) -> None:
-        """Without views, points come from what else the scene has; where it has nothing, a line says so."""
-        try:
-            self.parts.update({part: self._with_points(each) for part, each in self.parts.items() if part != "test"})
-        except InputError as error:
-            warnings.warn(f"{error}. The training goes on without points.", InputWarning, stacklevel=2)
-
     def items(self, part: Split) -> CachedFrames:
         """What batches of a part are made of: its frames, and views beside those that are trained on."""
         return self._mixed if part == "train" and self._mixed else self.parts[part].data
