@@ -55,18 +55,27 @@ def without_disagreeing(source: PosedDepth, names: Sequence[str]) -> tuple[Posed
         the frames that are left; and those that are not, by name, with the share of their depth that others meet.
 
     Raises:
-        InputError: where most frames disagree, or are too small or large for others to see what they saw: then it is
-            their unit, or the poses.
+        InputError: where most frames disagree, or see nothing that others see because their depth is less than the
+            way from camera to camera: then it is their unit, or the poses.
     """
     shares = agreement(source)
     off = {name: float(share) for name, share in zip(names, shares, strict=True) if share < LEAST_AGREEMENT}
-    unmet = np.flatnonzero(~(shares >= LEAST_AGREEMENT))
+    is_lost = np.isnan(shares) & (source.median_depth_m < way_between(source.world_from_cam))
+    unmet = np.flatnonzero((shares < LEAST_AGREEMENT) | is_lost)
     if len(unmet) > len(source) / 2:
         raise InputError(
             f"{names[unmet[0]]}: depth of this and {len(unmet) - 1} more of {len(source)} frames disagrees with the "
             "poses. Check the unit of both, or do without depth."
         )
     return source.select(~(shares < LEAST_AGREEMENT)), off  # NaN stays
+
+
+def way_between(world_from_cam: Floats) -> float:
+    """Distance from a camera to the nearest other, the median over them; 0 where there is one alone."""
+    position_m = world_from_cam[:, :3, 3]
+    apart_m = np.linalg.norm(position_m[:, None] - position_m, axis=-1)
+    np.fill_diagonal(apart_m, np.inf)
+    return float(np.median(apart_m.min(axis=1))) if len(position_m) > 1 else 0.0
 
 
 def _ratios(source: PosedDepth, least_apart: float) -> Iterator[Floats]:

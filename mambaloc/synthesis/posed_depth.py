@@ -35,7 +35,8 @@ class PosedDepth:
     @cached_property
     def median_depth_m(self) -> float:
         """The scene's scale: a camera that moves by a tenth of it sees a tenth of a radian of parallax."""
-        return float(np.nanmedian(self.depth_m))
+        known_m = self.depth_m[np.isfinite(self.depth_m)]
+        return float(np.median(known_m)) if len(known_m) else np.nan
 
     def apart(self, world_from_cam: Floats) -> Floats:
         """How differently cameras see: offset in median depths and turn of the view in radians, (V, 4, 4) -> (V, S)."""

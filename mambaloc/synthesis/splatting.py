@@ -1,7 +1,7 @@
 """Views of a scene at poses where nobody took a picture, from frames with depth.
 
 The depth of the nearest frames is splatted into the new camera with a z-buffer, whose cracks are closed. Each pixel is
-then looked up in the frames: the best-ranked one whose depth agrees within 3 % gives its colour, between pixels.
+then looked up in the frames: the best-ranked one whose depth agrees within 5 % gives its colour, between pixels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 FRAMES = 12
 """How many frames a view is made from."""
 
-_SAME_SURFACE = 0.03  # of the depth
+_SAME_SURFACE = 0.05  # of the depth
 _EDGE = 0.05  # of the depth, over three pixels
 _NEAR = 0.02  # of the median depth
 _FIRST = 4  # frames, in which a view's surfaces are looked up before the others
@@ -103,26 +103,38 @@ class Splatter:
             intrinsics: of the views, (V, 3, 3), in pixels of ``size``.
             size: (height, width) of the views.
             allowed: which frames each may be made from, (V, S); all unless given.
-            most_holes: views of which surfaces leave more open, as a share of their pixels, stay holes altogether.
+            most_holes: a view with a larger share of holes is given up, wherever that shows, and is not filled.
         """
         frames = self.nearest(world_from_cam, allowed)
         matrix, shift = between(self.source, frames, world_from_cam, intrinsics)
         back = np.linalg.inv(matrix)
         back_shift = -np.einsum("vnij,vnj->vni", back, shift)
-        images, depths_m = [], []
+        views = []
         for row, rows in enumerate(frames):  # one by one: more would not fit a core's cache
             few = slice((rows >= 0).sum())
-            frame = torch.from_numpy(rows[few]).to(self.device)
-            nearest = closed(self._z_buffer(frame, self._tensor(matrix[row, few]), self._tensor(shift[row, few]), size))
-            image, depth_m = torch.zeros(3, *size, device=self.device), torch.full_like(nearest, torch.nan)
-            if nearest.isinf().float().mean() <= most_holes:
-                cameras = self._tensor(back[row, few]), self._tensor(back_shift[row, few])
-                self._look_up(frame, *cameras, nearest, image.flatten(1), depth_m.flatten())
+            there, cameras = (matrix[row, few], shift[row, few]), (back[row, few], back_shift[row, few])
+            views.append(self._view(rows[few], there, cameras, size, most_holes))
+        images, depth_m = (torch.stack(each) for each in zip(*views, strict=True))
+        return Rendered(images, depth_m, depth_m.isnan().float().mean(dim=(1, 2)))
+
+    def _view(
+        self,
+        rows: NDArray[np.int64],
+        there: tuple[Floats, Floats],
+        back: tuple[Floats, Floats],
+        size: tuple[int, int],
+        most_holes: float,
+    ) -> tuple[Tensor, Tensor]:
+        """Picture (3, H, W) and depth (H, W) of a view from N frames, by matrices and shifts to it and to these."""
+        frame = torch.from_numpy(rows).to(self.device)
+        nearest = closed(self._z_buffer(frame, self._tensor(there[0]), self._tensor(there[1]), size))
+        image, depth_m = torch.zeros(3, *size, device=self.device), torch.full_like(nearest, torch.nan)
+        if nearest.isinf().float().mean() <= most_holes:
+            cameras = self._tensor(back[0]), self._tensor(back[1])
+            self._look_up(frame, *cameras, nearest, image.flatten(1), depth_m.flatten())
+            if depth_m.isnan().float().mean() <= most_holes:
                 image = filled(image[None], depth_m.isfinite()[None, None].to(image))[0]
-            images.append(image.clamp_(0, 255).round_().byte())
-            depths_m.append(depth_m)
-        depth_m = torch.stack(depths_m)
-        return Rendered(torch.stack(images), depth_m, depth_m.isnan().float().mean(dim=(1, 2)))
+        return image.clamp_(0, 255).round_().byte(), depth_m
 
     def _z_buffer(self, frame: Tensor, matrix: Tensor, shift: Tensor, size: tuple[int, int]) -> Tensor:
         """Depth (H, W) of the nearest point of N frames on each pixel of a view; infinite where there is none."""

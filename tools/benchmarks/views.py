@@ -32,7 +32,7 @@ from mambaloc.synthesis import (
     make_views,
     without_disagreeing,
 )
-from mambaloc.synthesis.depth_from_pictures import range_from_pictures, range_of_points
+from mambaloc.synthesis.depth_from_pictures import enlarged, range_from_pictures, range_of_points, searched
 from mambaloc.viz.views import draw_views
 
 _SHORT_SIDE = 108
@@ -99,14 +99,15 @@ def with_sensor(pictures: PosedDepth, frames: PosedFrames, folder: Path) -> tupl
 
 def compare(pictures: PosedDepth, sensor: PosedDepth, rows: np.ndarray, points_m: np.ndarray | None) -> None:
     """Print how plane sweep answers where the sensor measured."""
-    cameras = pictures.intrinsics, pictures.world_from_cam
+    images, intrinsics = searched(pictures.images, pictures.intrinsics)
+    cameras, size = (intrinsics, pictures.world_from_cam), pictures.images.shape[2:]
     if points_m is None:
-        range_m = range_from_pictures(pictures.images, *cameras)
+        range_m = range_from_pictures(images, *cameras)
     else:
-        range_m = range_of_points(points_m, *cameras, pictures.images.shape[2:])
+        range_m = range_of_points(points_m, *cameras, images.shape[2:])
     print(f"searched between {range_m[0]:.2f} and {range_m[1]:.2f} m")
     began = time.process_time()
-    found = replace(sensor, depth_m=PlaneSweep(pictures.images, *cameras, range_m).depth_m(rows))
+    found = replace(sensor, depth_m=enlarged(PlaneSweep(images, *cameras, range_m).depth_m(rows), size))
     seconds = (time.process_time() - began) / len(rows)
     for name, depth_m in (("all", found.depth_m), ("confirmed", confirmed(found).depth_m)):
         is_both = np.isfinite(depth_m) & np.isfinite(sensor.depth_m)
