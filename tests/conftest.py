@@ -183,3 +183,32 @@ def _bundle(made_once, name: str, run: Path, raw_input: bool) -> Path:
         write_bundle(system, data, folder / "bundle", ("onnx", "fp16", "ort"), raw_input=raw_input)
 
     return made_once(name, export) / "bundle"
+
+
+@pytest.fixture(scope="session")
+def bundles_for_lenses(made_once, den):
+    """Bundles of a tiny DenseLoc: ``tensors``, and ``pictures``, which are taken as they are.
+
+    Not in float16: an untrained network's rays hardly determine a rotation, so that rounding turns it by degrees.
+    """
+    import torch
+
+    from mambaloc.data import PoseDataModule
+    from mambaloc.export import onnx, write_bundle
+    from mambaloc.models.denseloc import LitDenseLoc
+
+    def export(folder: Path) -> None:
+        size, formats = (64, 96), ("onnx", "ort")
+        data = PoseDataModule("7scenes", str(den), "den", image_size=size, short_side=72, validation="none")
+        data.setup("fit")
+        torch.manual_seed(0)
+        system = LitDenseLoc(TINY_BACKBONE, dim=16, heads=2, encoder_layers=1, feedforward=16, image_size=size).eval()
+        network = system.network
+        network.head.position_scale.fit(data.train_position_m)
+        network.default_intrinsics.copy_(data.train_intrinsics.median(dim=0).values)
+        write_bundle(system, data, folder / "tensors", formats, "web")
+        with pytest.MonkeyPatch.context() as patch:  # the conversion takes seconds
+            patch.setattr(onnx, "_write", lambda *_: shutil.copyfile(folder / "tensors/model.onnx", _[-1]))
+            write_bundle(system, data, folder / "pictures", formats, "web", raw_input=True)
+
+    return made_once("bundles_for_lenses", export)

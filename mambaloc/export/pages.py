@@ -74,13 +74,24 @@ Camera pose of one RGB image, {contract.pose}.
 `python tools/verify_bundle.py FOLDER` checks it, `python tools/demo.py FOLDER` shows it in a browser. An app ships a
 model, the map if there is one, and `contract.json`; `frames/` are for checking a port.
 
-## How sure it is
+{_lens(contract)}## How sure it is
 
 {_uncertainty(contract)}
 
 ## Trained
 
 {trained}
+"""
+
+
+def _lens(contract: Contract) -> str:
+    if contract.intrinsics is None:
+        return ""
+    return """## Another lens
+
+Pictures of any camera and shape are localised if their intrinsics are known. The models take them as a required input,
+which `INTEGRATION.md` fills in with the training camera's, `intrinsics` in `contract.json`, where they are not.
+
 """
 
 

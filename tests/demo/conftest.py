@@ -122,6 +122,12 @@ def map_site(made_once, map_bundle, film, modules):
 
 
 @pytest.fixture(scope="session")
+def lens_site(made_once, bundles_for_lenses, modules):
+    bundle = bundles_for_lenses / "tensors"
+    return made_once("demo_lens_site", lambda folder: build_site(bundle, folder / "site")) / "site"
+
+
+@pytest.fixture(scope="session")
 def served():
     """Serves a folder as long as a block lasts."""
     return _served

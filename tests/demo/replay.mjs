@@ -13,8 +13,8 @@ const { Localiser } = await import(pathToFileURL(join(web, "localiser.js")));
 const contract = JSON.parse(await readFile(join(bundle, "contract.json"), "utf8"));
 const localiser = await Localiser.create(ort, await readFile(join(bundle, model)), contract);
 const found = [];
-for (const { file } of contract.frames) {
+for (const { file, intrinsics } of contract.frames) {
   const { data, width, height } = PNG.sync.read(await readFile(join(bundle, file)));
-  found.push(await localiser.localise({ data, width, height, channels: 4 }));
+  found.push(await localiser.localise({ data, width, height, channels: 4 }, intrinsics));
 }
 console.log(JSON.stringify(found));

@@ -34,6 +34,19 @@ def test_poses_in_node_are_pythons(which, model, modules, request, node):
         assert rotation_error_deg(np.array(pose["quaternion_wxyz"]), expected.quaternion) < 0.1
 
 
+@pytest.mark.parametrize(("kind", "model"), [("tensors", "model.onnx"), ("pictures", "model.ort")])
+def test_poses_through_another_lens_in_node_are_pythons(kind, model, bundles_for_lenses, modules, node):
+    folder = bundles_for_lenses / kind
+    found = json.loads(node(HERE / "replay.mjs", modules, WEB, folder, model))
+    localiser = Localiser(folder / model)
+    frames = json.loads((folder / "contract.json").read_text())["frames"]
+    assert len(found) == len(frames) == 6
+    for pose, frame in zip(found, frames, strict=True):
+        expected = localiser.localise(folder / frame["file"], frame["intrinsics"])
+        assert 1000 * np.linalg.norm(np.array(pose["position_m"]) - expected.position_m) < 1
+        assert rotation_error_deg(np.array(pose["quaternion_wxyz"]), expected.quaternion) < 0.05
+
+
 CASES = [  # (height, width) of the picture, short side, crop
     ((480, 640), 256, (224, 224)),
     ((240, 320), 78, (72, 96)),
@@ -111,21 +124,32 @@ def code_of(page, language, holding):
     return code
 
 
-@pytest.mark.parametrize("model", ["model.onnx", "model.fp16.onnx"])
-def test_the_page_on_pcs_in_python(raw_bundle, model, tmp_path):
+@pytest.fixture(params=["usual", "lenses"])
+def pictures(request):
+    """A bundle of models that take pictures as they are, and perhaps their cameras."""
+    if request.param == "usual":
+        return request.getfixturevalue("raw_bundle")
+    return request.getfixturevalue("bundles_for_lenses") / "pictures"
+
+
+@pytest.mark.parametrize("precision", ["", "fp16."])
+def test_the_page_on_pcs_in_python(pictures, precision, tmp_path):
+    model = f"model.{precision}onnx"
+    if not (pictures / model).is_file():
+        pytest.skip("an untrained DenseLoc is not exported in float16")
     (tmp_path / "localise.py").write_text(code_of("pc.md", "python", "class Localiser"))
-    command = [sys.executable, tmp_path / "localise.py", raw_bundle, model]
+    command = [sys.executable, tmp_path / "localise.py", pictures, model]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout == "the port is right\n", done.stderr
 
 
-def test_the_page_on_pcs_in_node(raw_bundle, modules, tmp_path, node):
+def test_the_page_on_pcs_in_node(pictures, modules, tmp_path, node):
     (tmp_path / "node_modules").symlink_to(modules)
     (tmp_path / "localise.mjs").write_text(code_of("pc.md", "js", "localise.mjs"))
-    assert node(tmp_path / "localise.mjs", raw_bundle, cwd=tmp_path) == "the port is right\n"
+    assert node(tmp_path / "localise.mjs", pictures, cwd=tmp_path) == "the port is right\n"
 
 
-def test_the_page_on_the_web(raw_bundle, modules, tmp_path, node):
+def test_the_page_on_the_web(pictures, modules, tmp_path, node):
     """Its class and its check, with the build for Node in place of the browser's."""
     (tmp_path / "node_modules").symlink_to(modules)
     code = code_of("web.md", "js", "// localiser.js").replace("./ort/ort.wasm.min.mjs", "onnxruntime-web")
@@ -143,4 +167,4 @@ def test_the_page_on_the_web(raw_bundle, modules, tmp_path, node):
         console.log("the port is right");
         """
     )
-    assert node(tmp_path / "check.mjs", raw_bundle, cwd=tmp_path) == "the port is right\n"
+    assert node(tmp_path / "check.mjs", pictures, cwd=tmp_path) == "the port is right\n"

@@ -35,6 +35,12 @@ def map_address(map_site, served):
 
 
 @pytest.fixture(scope="module")
+def lens_address(lens_site, served):
+    with served(lens_site) as server:
+        yield f"http://127.0.0.1:{server.server_port}/"
+
+
+@pytest.fixture(scope="module")
 def load(browser):
     """Loads the page of an address, once; gives it with the errors in its console."""
     context = browser.new_context()
@@ -107,6 +113,33 @@ def test_a_bundle_that_takes_pictures_as_they_are(opened, raw_bundle, raw_addres
     page = opened("frames", raw_address)
     page.click('[data-frame-file="frames/1.png"]')
     check(pose_of(page), Localiser(raw_bundle).localise(raw_bundle / "frames/1.png"))
+
+
+def test_poses_through_another_lens_are_pythons(opened, bundles_for_lenses, lens_address):
+    folder = bundles_for_lenses / "tensors"
+    page, localiser = opened("frames", lens_address), Localiser(folder)
+    frames = json.loads((folder / "contract.json").read_text())["frames"]
+    for count, frame in enumerate(frames, start=1):
+        page.click(f'[data-frame-file="{frame["file"]}"]')
+        check(pose_of(page, count), localiser.localise(folder / frame["file"], frame["intrinsics"]), deg=0.05)
+    assert page.is_hidden("#lens")  # the contract says what took them
+
+
+def test_the_page_is_told_what_lens_took_a_photo(opened, bundles_for_lenses, lens_address, tmp_path):
+    folder, path = bundles_for_lenses / "tensors", tmp_path / "upright.png"
+    upright = cv2.imread(str(folder / "frames/2.png"))[:, 20:110]
+    cv2.imwrite(str(path), upright)
+    page, localiser = opened("photo", lens_address), Localiser(folder)
+    page.fill("#focal", "")
+    page.set_input_files("#photo", path)
+    page.wait_for_selector("body[data-state=error]", timeout=30_000)
+    assert "or say what lens took it" in page.inner_text("#error")
+    page.fill("#focal", "30")
+    page.press("#focal", "Enter")  # and the photo is localised again
+    focal_px = 30 * np.hypot(90, 120) / np.hypot(36, 24)
+    intrinsics = [[focal_px, 0, 44.5], [0, focal_px, 59.5], [0, 0, 1]]
+    check(pose_of(page), localiser.localise(path, intrinsics), deg=0.05)
+    assert page.is_hidden("#error")
 
 
 def test_how_sure_a_model_is(opened, raw_bundle, raw_address, tmp_path):

@@ -11,13 +11,12 @@ import argparse
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
-from rich import print as rich_print
-from rich.table import Table
+from numpy.typing import ArrayLike, NDArray
 
 from mambaloc import provenance
-from mambaloc.console import exits_cleanly, progress
+from mambaloc.console import exits_cleanly
 from mambaloc.errors import InputError
+from mambaloc.images import Image
 from mambaloc.rendering import default_intrinsics, embedded_room, render, sensor
 from mambaloc.rendering.scenes.embedded import embedded_shots
 from mambaloc.rendering.scenes.shots import Shot
@@ -46,19 +45,22 @@ def main() -> None:
         raise InputError(f"{args.model}: takes no intrinsics. Give a model that does, such as DenseLoc's.")
     shots = [shot for shot in embedded_shots() if shot.split == "test"][:: args.every]
     print(provenance.machine())
-    table = Table("camera", "median m", "deg", "mean m", "deg", "over training's", "camera unstated, m", "deg")
-    errors, first = (
-        {name: lens_errors(localiser, shots, name) for name in progress(LENSES, "lenses", len(LENSES))},
-        None,
+    print(
+        f"{len(shots)} views each; camera stated: median, mean, median over that of training; camera unstated: median"
     )
-    for name, (stated, unstated) in errors.items():
+    training: NDArray[np.float64] | None = None
+    for name in LENSES:
+        stated, unstated = lens_errors(localiser, shots, name)
         median, mean = np.median(stated, axis=0), stated.mean(axis=0)
-        first = median if first is None else first
-        without = ["-", "-"] if unstated is None else [f"{each:.3f}" for each in np.median(unstated, axis=0)]
-        ratios = "{:.2f} {:.2f}".format(*median / first)
-        table.add_row(name, *(f"{each:.3f}" for each in (*median, *mean)), ratios, *without)
-    rich_print(table)
-    print(f"{len(shots)} views each")
+        training = median if training is None else training
+        ratio_m, ratio_deg = median / training
+        without = "too narrow" if unstated is None else in_words(np.median(unstated, axis=0))
+        print(f"{name:27} {in_words(median)}, {in_words(mean)}, {ratio_m:.2f} {ratio_deg:.2f}; {without}", flush=True)
+
+
+def in_words(error: NDArray[np.float64]) -> str:
+    """Metres and degrees."""
+    return f"{error[0]:.3f} m {error[1]:.2f} deg"
 
 
 def lens_errors(
@@ -79,13 +81,11 @@ def lens_errors(
     return np.array(stated), np.array(unstated) if unstated else None
 
 
-def error(
-    localiser: Localiser, rgb: NDArray[np.uint8], intrinsics: NDArray[np.float64] | None, shot: Shot
-) -> tuple[float, float]:
+def error(localiser: Localiser, rgb: Image, intrinsics: ArrayLike | None, shot: Shot) -> tuple[float, float]:
     """Of one view, in metres and degrees."""
     found = localiser.localise(rgb, intrinsics)
     off_m = float(np.linalg.norm(found.position_m - shot.world_from_cam[:3, 3]))
-    return off_m, rotation_error_deg(found.quaternion, quaternion_from_matrix(shot.world_from_cam[:3, :3]))
+    return off_m, float(rotation_error_deg(found.quaternion, quaternion_from_matrix(shot.world_from_cam[:3, :3])))
 
 
 if __name__ == "__main__":
