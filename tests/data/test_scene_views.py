@@ -28,6 +28,11 @@ SIZE, SHORT_SIDE, CROP = (96, 72), 48, (40, 56)
 TRAIN, VAL, TEST = 40, 12, 8
 
 
+@pytest.fixture(scope="module")
+def room():
+    return embedded_room()
+
+
 @pytest.fixture(scope="session")
 def room_with_depth(made_once):
     """A root with one scene, the embedded room: 40 training, 12 validation, 8 test frames, every other with depth."""
@@ -172,7 +177,7 @@ def test_views_are_augmented_as_frames_are(make):
 # --- what views are --------------------------------------------------------------------------------------------------
 
 
-def test_views_show_what_the_renderer_shows_there(make):
+def test_views_show_what_the_renderer_shows_there(make, room):
     data = make()
     data.train_dataloader()
     items = data.scene.items("train")
@@ -182,14 +187,14 @@ def test_views_show_what_the_renderer_shows_there(make):
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(batch.quaternion[row].double().numpy(), scalar_first=True).as_matrix()
         pose[:3, 3] = batch.position_m[row]
-        picture, _ = render(embedded_room(), batch.intrinsics[row].double().numpy(), pose, (64, 48))
+        picture, _ = render(room, batch.intrinsics[row].double().numpy(), pose, (64, 48))
         off.append(np.abs(batch.image[row].permute(1, 2, 0).numpy().astype(float) - picture).mean())
     assert np.median(off) < 12
     torch.testing.assert_close(batch.intrinsics, items.intrinsics[:1].expand(24, 3, 3))
 
 
 @pytest.mark.parametrize("view_depth", ["sensor", "pictures"])
-def test_points_lie_on_the_surfaces_that_frames_and_views_show(make, view_depth):
+def test_points_lie_on_the_surfaces_that_frames_and_views_show(make, room, view_depth):
     """Of frames with depth and without, held out or not, and of views: OpenCV and the renderer agree on them."""
     data = make(points_per_frame=32, view_depth=view_depth)
     data.train_dataloader()
@@ -211,7 +216,7 @@ def test_points_lie_on_the_surfaces_that_frames_and_views_show(make, view_depth)
             assert (np.abs(pixels - (31.5, 23.5)) < (32.5, 24.5)).all()
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = rotation, position_m
-            depth_m = render(embedded_room(), matrix, pose, (64, 48))[1]
+            depth_m = render(room, matrix, pose, (64, 48))[1]
             x, y = np.rint(pixels).astype(int).clip(0, (63, 47)).T
             ratios.append(np.median(((seen - position_m) @ rotation)[:, 2] / depth_m[y, x]))
     np.testing.assert_allclose(ratios, 1, atol=0.02 if view_depth == "sensor" else 0.05)
@@ -298,21 +303,26 @@ def test_bad_depth_frames_are_named_and_left_out(make, room_with_depth, tmp_path
     assert lines_of(make, root=root, cache_dir=str(tmp_path))[1] == lines  # said again where views are only opened
 
 
-@pytest.mark.parametrize("change", ["unit", "empty", "none", "few"])
+@pytest.mark.parametrize("change", ["thousandth", "thousandfold", "empty", "none", "few"])
 def test_depth_that_cannot_be_used_gives_way_to_the_pictures_unless_it_was_asked_for(
     make, room_with_depth, tmp_path, change, monkeypatch
 ):
     root = copied(room_with_depth, tmp_path)
     for number, file in enumerate(depth_files(root)):
-        if change == "unit":  # a thousandth; sixteen bits hold no thousandfold
+        if change == "thousandth":
             cv2.imwrite(str(file), np.maximum(cv2.imread(str(file), cv2.IMREAD_UNCHANGED) // 1000, 1))
+        elif change == "thousandfold":  # which sixteen bits do not hold: poses are in kilometres
+            pose_file = str(file).replace(".depth.png", ".pose.txt")
+            np.savetxt(pose_file, np.loadtxt(pose_file) * ([[1, 1, 1, 0.001]] * 3 + [[1, 1, 1, 1]]))
         elif change == "empty":
             cv2.imwrite(str(file), np.zeros((72, 96), np.uint16))
         elif change == "none" or number % 2:
             file.unlink()
+    disagrees = r"depth.png: depth of this and \d+ more of 20 frames disagrees with the poses. Check the unit"
     expected = {
-        "unit": r"depth.png: depth of this and \d+ more of 20 frames disagrees with the poses. Check the unit",
-        "empty": r"depth.png: depth has no measured pixel, and no other depth frame can be used. Mend or remove them",
+        "thousandth": disagrees,
+        "thousandfold": disagrees,
+        "empty": r"depth.png: depth has no measured pixel, and no other depth frame can be used. Mend them, or set",
         "none": "no training frame has depth. Set data.view_depth to pictures",
         "few": "10 of 40 training frames have depth, too few",
     }[change]
