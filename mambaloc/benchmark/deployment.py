@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median, quantiles
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import onnx
 import onnxruntime
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
@@ -25,6 +27,7 @@ from mambaloc.export.precision import half_precision
 from mambaloc.export.quantisation import eight_bit, median_errors
 from mambaloc.metrics import summarise
 from mambaloc.models import LitPoseRegressor
+from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT
 
 _A_TURN = 5  # repetitions
 
@@ -129,13 +132,16 @@ def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict
     weights = io.BytesIO()
     torch.save(system.network.state_dict(), weights)
     half, int8 = half_precision(exported), eight_bit(exported, data)
+    feeds = {IMAGE_INPUT: image.numpy()}
+    if system.network.takes_intrinsics:
+        feeds[INTRINSICS_INPUT] = system.network.default_intrinsics[None].numpy()
     said = summarise(localise_test_frames(system, data, "cpu"))
     return {
         "PyTorch": _Form(weights.tell(), _eager(system, image), _medians(said)),
-        "float32": _on_onnx_runtime(exported, image, threads, _medians(median_errors(exported, data))),
-        "float16": _on_onnx_runtime(half, image, threads, _medians(median_errors(half, data))),
+        "float32": _on_onnx_runtime(exported, feeds, threads, _medians(median_errors(exported, data))),
+        "float16": _on_onnx_runtime(half, feeds, threads, _medians(median_errors(half, data))),
         "int8" if int8.kind == "all layers" else f"int8 {int8.kind}": _on_onnx_runtime(
-            int8.model, image, threads, (int8.position_error_m, int8.rotation_error_deg), int8.fits
+            int8.model, feeds, threads, (int8.position_error_m, int8.rotation_error_deg), int8.fits
         ),
     }
 
@@ -153,7 +159,11 @@ def _eager(system: LitPoseRegressor, image: Tensor) -> Callable[[], object]:
 
 
 def _on_onnx_runtime(
-    model: onnx.ModelProto, image: Tensor, threads: int, errors: tuple[float, float], fits: bool = True
+    model: onnx.ModelProto,
+    feeds: Mapping[str, NDArray[Any]],
+    threads: int,
+    errors: tuple[float, float],
+    fits: bool = True,
 ) -> _Form:
     content = model.SerializeToString()
     options = onnxruntime.SessionOptions()
@@ -161,5 +171,4 @@ def _on_onnx_runtime(
     options.intra_op_num_threads = threads
     options.add_session_config_entry("session.force_spinning_stop", "1")  # else it disturbs whose turn is next
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    feed = {"image": image.numpy()}
-    return _Form(len(content), lambda: session.run(None, feed), errors, fits)
+    return _Form(len(content), lambda: session.run(None, feeds), errors, fits)
