@@ -11,8 +11,7 @@ from mambaloc.synthesis import Splatter, Views
 from mambaloc.synthesis.posed_depth import Floats
 
 _STEP_PX = 2  # frames are rendered so much smaller; of their pixels a few hundred are drawn
-_AT_ONCE = {"cpu": 1}  # frames; more would not fit a core's cache
-_AT_ONCE_ELSEWHERE = 64
+_AT_ONCE = 64  # frames
 
 
 def points_of_views(views: Views, count: int, seed: int) -> ScenePoints:
@@ -47,9 +46,8 @@ def points_of_frames_by_depth(
     size = (height // _STEP_PX, width // _STEP_PX)
     intrinsics = resized_intrinsics(data.intrinsics.double().cpu(), size[1] / width, size[0] / height).numpy()
     points: list[Points] = []
-    at_once = _AT_ONCE.get(splatter.device.type, _AT_ONCE_ELSEWHERE)
-    for start in range(0, len(world_from_cam), at_once):
-        rows = range(start, min(start + at_once, len(world_from_cam)))
+    for start in range(0, len(world_from_cam), _AT_ONCE):
+        rows = range(start, min(start + _AT_ONCE, len(world_from_cam)))
         depth_m = splatter.render(world_from_cam[rows], intrinsics[rows], size).depth_m.cpu().numpy()
         points += [
             _lifted(each, intrinsics[row], world_from_cam[row], count, frame_rng(seed, data.frames.image_paths[row]))
