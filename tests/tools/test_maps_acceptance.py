@@ -38,7 +38,7 @@ def test_coefficients_and_shares_of_drawn_evidence(tmp_path):
     assert lines[1].startswith("20000 frames, 20000 pictures")
     known = np.log(np.column_stack((rows[:, 4] + 0.5, rows[:, 5], rows[:, 6] + 0.1)))
     accepted = coefficients[0] + known @ coefficients[1:] > np.log(0.95 / 0.05)
-    (all_of,) = [line for line in lines if line.startswith("fitted to the others")]
+    (all_of,) = [line for line in lines if line.startswith("fitted to others, 0.95")]
     assert int(all_of.split("accepted")[1].split()[0]) == pytest.approx(accepted.sum(), rel=0.05)
     wrong = float(all_of.split(", ")[-1].split("%")[0])
     assert wrong == pytest.approx(100 * (accepted & ~is_right).sum() / accepted.sum(), abs=0.3)

@@ -7,14 +7,13 @@ MODEL is exported from a training on the embedded scene: a file or a bundle. Its
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mambaloc import provenance
-from mambaloc.console import exits_cleanly
+from mambaloc.console import OptionParser, exits_cleanly, whole_number
 from mambaloc.errors import InputError
 from mambaloc.images import Image
 from mambaloc.rendering import default_intrinsics, embedded_room, render, sensor
@@ -36,9 +35,9 @@ LENSES = {  # focal length over the training camera's, and (width, height) in pi
 @exits_cleanly
 def main() -> None:
     """Localise and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OptionParser(description=__doc__)
     parser.add_argument("model", metavar="MODEL")
-    parser.add_argument("--every", type=int, default=1, help="of the test views, every so many-th")
+    parser.add_argument("--every", type=whole_number(1), default=1, help="of the test views, every so many-th")
     args = parser.parse_args()
     localiser = Localiser(args.model, 1, sparse_map=False)
     if localiser.contract is None or localiser.contract.intrinsics is None:
