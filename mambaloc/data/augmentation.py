@@ -12,6 +12,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mambaloc.errors import InputError
@@ -165,9 +166,9 @@ def center_crop(image: Tensor, crop: tuple[int, int]) -> Tensor:
     return image[..., top : top + crop[0], left : left + crop[1]].float() / 255
 
 
-def center_corner(image: Tensor, crop: tuple[int, int]) -> tuple[int, int]:
+def center_corner(images: Tensor | NDArray[np.uint8], crop: tuple[int, int]) -> tuple[int, int]:
     """Row and column of the top-left pixel of a batch's centre crop; (B, 3, H, W) -> two numbers."""
-    return (image.shape[-2] - crop[0]) // 2, (image.shape[-1] - crop[1]) // 2
+    return (images.shape[-2] - crop[0]) // 2, (images.shape[-1] - crop[1]) // 2
 
 
 def centered(batch: PoseBatch, crop: tuple[int, int]) -> PoseBatch:

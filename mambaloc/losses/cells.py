@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from mambaloc.geometry import conjugate, matrix_from_quaternion, normalize, project, rotate
+from mambaloc.geometry import conjugate, normalize, project, rotate
 from mambaloc.losses.weighted import pose_distances, weighed
 from mambaloc.types import CellPrediction, PoseBatch, PosePrediction
 
@@ -61,8 +61,7 @@ class CellWeights(nn.Module):
 def _direction_distance(cells: CellPrediction, target: PoseBatch) -> Tensor:
     if cells.rays_world is None:  # the cells say quaternions, of which the loss sees the mean
         return cells.position_m.new_zeros(())
-    matrix = matrix_from_quaternion(target.quaternion)
-    true = (matrix[:, None] * cells.rays_cam[:, :, None, :]).sum(dim=-1)
+    true = rotate(target.quaternion[:, None], cells.rays_cam)
     return torch.linalg.vector_norm(cells.rays_world - true, dim=-1).mean() / 2
 
 

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from mambaloc.data.cameras import assumed_intrinsics
 from mambaloc.errors import InputError
 from mambaloc.geometry import grid_rays
 from mambaloc.models.base import LitPoseRegressor
@@ -27,8 +28,6 @@ from mambaloc.nn import (
 from mambaloc.types import PosePrediction
 
 Head = Literal["dense", "token"]
-
-_USUAL_FOCAL = 0.87  # over the longer side, until a training's camera is known
 
 
 class DenseLoc(PoseNetwork):
@@ -85,7 +84,8 @@ class DenseLoc(PoseNetwork):
         self.position_gis = build_gis(gis, dim, discretisation)
         self.orientation_gis = build_gis(gis, dim, discretisation)
         self.head = CellHead(dim, rotation, position, head_hidden) if self.is_dense else PoseHead(dim)
-        self.register_buffer("default_intrinsics", _usual_camera(image_size))
+        usual = torch.from_numpy(assumed_intrinsics(image_size[::-1])).float()  # until a training's cameras are known
+        self.register_buffer("default_intrinsics", usual)
 
     def features(self, feats: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Turn the feature maps into both branches' features of each cell; (B, N, dim) each, N = 1 for a token."""
@@ -154,9 +154,3 @@ class LitDenseLoc(LitPoseRegressor):
         super().setup(stage)
         if stage == "fit" and (data := getattr(self.trainer, "datamodule", None)) is not None:
             self.network.default_intrinsics.copy_(data.train_intrinsics.median(dim=0).values)
-
-
-def _usual_camera(image_size: tuple[int, int]) -> Tensor:
-    height, width = image_size
-    focal_px = _USUAL_FOCAL * max(image_size)
-    return torch.tensor([[focal_px, 0.0, (width - 1) / 2], [0.0, focal_px, (height - 1) / 2], [0.0, 0.0, 1.0]])

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mambaloc.geometry import align_directions, canonical, intersect_rays, matrix_from_quaternion
+from mambaloc.geometry import align_directions, canonical, intersect_rays, rotate
 from mambaloc.nn.heads import PositionScale, RegressionHead
 from mambaloc.types import CellPrediction, PosePrediction
 
@@ -78,7 +78,7 @@ class CellHead(nn.Module):
         position, points = (position_weights[..., None] * votes).sum(dim=1), None
         if self.sees_points:
             points, position_weights = _said(self.points(position_BND))
-            directions = (matrix_from_quaternion(quaternion)[:, None] * rays_cam[:, :, None, :]).sum(dim=-1)
+            directions = rotate(quaternion[:, None], rays_cam)
             position = intersect_rays(directions, points, position_weights, position, _VOTES_WEIGHT)
         metres = self.position_scale
         cells = CellPrediction(
