@@ -53,6 +53,7 @@ class PoseBatch:
         ``clip_length``: so many successive rows are frames of one sequence, in time order; B is a multiple of it.
         ``points_m`` (B, P, 3): scene points that each frame may see, world frame, NaN where it has fewer than P.
         ``intrinsics`` (B, 3, 3): pinhole matrices in pixels of ``image``, no skew; the data module always gives them.
+        ``holes`` (B, H, W) bool: pixels of synthetic views that show nothing of the scene; None where there are none.
     """
 
     image: Tensor
@@ -62,6 +63,7 @@ class PoseBatch:
     clip_length: int = 1
     points_m: Tensor | None = None
     intrinsics: Tensor | None = None
+    holes: Tensor | None = None
 
     def pin_memory(self) -> PoseBatch:
         """Copy to page-locked memory; the DataLoader calls it where ``pin_memory=True``."""

@@ -29,6 +29,7 @@ from mambaloc.images import LUMA
 from mambaloc.types import PoseBatch
 
 _MOST_DEG = 45.0
+_DONORS = 3  # images that a hole may be filled from
 
 View = Literal["crop", "rotation"]
 
@@ -83,8 +84,11 @@ class RandomCrop:
     def __call__(self, batch: PoseBatch, color: Tensor, uniform: Tensor) -> PoseBatch:
         """Crop and colour a batch; ``image`` (B, 3, H, W) uint8 becomes (B, 3, *size) float32 in 0..1."""
         top, left = self.corners(batch.image, uniform)
-        image = colored(_crops(batch.image, top, left, self.size), color)
-        return replace(batch, image=image, intrinsics=_cropped(batch, top, left))
+        image, holes = colored(_crops(batch.image, top, left, self.size), color), None
+        if batch.holes is not None:
+            holes = _crops(batch.holes[:, None], top, left, self.size)[:, 0]
+            image = filled_from_each_other(image, holes)
+        return replace(batch, image=image, intrinsics=_cropped(batch, top, left), holes=holes)
 
 
 @dataclass(frozen=True)
@@ -125,12 +129,12 @@ class RandomRotation:
         scale = torch.exp(spread[:, 3] * math.log1p(self.zoom))
         intrinsics[:, :2, :2] *= scale[:, None, None]
         homography = rotation_homography(batch.intrinsics, matrix_from_quaternion(cam_from_turned), intrinsics)
-        return replace(
-            batch,
-            image=warped(colored(batch.image, color), homography, self.size),
-            quaternion=canonical(multiply(batch.quaternion, cam_from_turned)),
-            intrinsics=intrinsics,
-        )
+        image, holes = warped(colored(batch.image, color), homography, self.size), None
+        if batch.holes is not None:
+            holes = warped(batch.holes[:, None].to(image), homography, self.size)[:, 0] > 0.5
+            image = filled_from_each_other(image, holes)
+        quaternion = canonical(multiply(batch.quaternion, cam_from_turned))
+        return replace(batch, image=image, quaternion=quaternion, intrinsics=intrinsics, holes=holes)
 
 
 def draw_uniforms(seed: int, epoch: int, frames: int, draws: int) -> Tensor:
@@ -158,6 +162,19 @@ def colored(image: Tensor, color: Tensor) -> Tensor:
     """Map the colours of a batch; (B, 3, H, W) uint8, (B, 3, 4) -> (B, 3, H, W) float32 in 0..1."""
     pixels = torch.baddbmm(color[..., 3:], color[..., :3] / 255, image.flatten(2).float())
     return pixels.clamp_(0, 1).unflatten(-1, image.shape[-2:])
+
+
+def filled_from_each_other(image: Tensor, holes: Tensor) -> Tensor:
+    """Fill holes with what other images of the batch show at the same pixels; (B, 3, H, W), (B, H, W) bool.
+
+    A network then learns to answer from the rest of a view, as it must where a query shows what no training frame does.
+    """
+    known, whole = ~holes, image
+    for shift in range(1, min(len(image), _DONORS + 1)):
+        donor = ~known & ~holes.roll(shift, 0)
+        image = torch.where(donor[:, None], whole.roll(shift, 0), image)
+        known = known | donor
+    return image
 
 
 def center_crop(image: Tensor, crop: tuple[int, int]) -> Tensor:

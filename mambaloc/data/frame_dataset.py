@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -65,7 +65,7 @@ class CachedFrames(Dataset[PoseBatch]):
         """Decoded pictures of some rows, (B, 3, H, W)."""
         return np.stack([self.images[row] for row in rows])
 
-    def to(self, device: torch.device) -> CachedFrames:
+    def to(self, device: torch.device) -> Self:
         """Return the same frames, whole in a device's memory: batches are made there, and nothing is copied to it."""
         there = copy(self)
         there.resident = torch.from_numpy(self.pictures(range(len(self.position_m)))).to(device)

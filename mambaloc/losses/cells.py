@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mambaloc.geometry import conjugate, normalize, project, rotate
@@ -16,7 +17,7 @@ class CellWeights(nn.Module):
     A cell's distances are of its guess of the camera's centre, in metres, and half of that between the direction in
     which it looks and the true one, which for small angles is the distance of unit quaternions. A cell that says a
     scene point is compared with the true point nearest to its centre, where the batch has one in the cell; its distance
-    counts as one of position.
+    counts as one of position. A cell in a hole of a synthetic view counts as much as it shows of the scene.
 
     Args:
         s_position: initial log-variance of position.
@@ -50,19 +51,30 @@ class CellWeights(nn.Module):
             raise ValueError("loss cells: needs a dense head; choose learned_weights for other systems")
         position, rotation = pose_distances(prediction, target, "l2", nearest_sign=True)
         if self.cell_weight:
+            share = _share_of_cells(cells, target)
             offset_m = cells.position_m - target.position_m[:, None]
-            position = position + self.cell_weight * torch.linalg.vector_norm(offset_m, dim=-1).mean()
-            rotation = rotation + self.cell_weight * _direction_distance(cells, target)
+            distance_m = torch.linalg.vector_norm(offset_m, dim=-1)
+            position = position + self.cell_weight * (share * distance_m).sum()
+            rotation = rotation + self.cell_weight * _direction_distance(cells, target, share)
         if self.point_weight and cells.points_m is not None and target.points_m is not None:
             position = position + self.point_weight * _point_distance(cells.points_m, cells.grid, target)
         return weighed(position, self.s_position) + weighed(rotation, self.s_rotation)
 
 
-def _direction_distance(cells: CellPrediction, target: PoseBatch) -> Tensor:
+def _share_of_cells(cells: CellPrediction, target: PoseBatch) -> Tensor:
+    """What each cell counts in a mean, (B, N) or one number: as much as it shows of the scene."""
+    count = cells.rays_cam[..., 0]
+    if target.holes is None:
+        return count.new_tensor(1 / count.numel())
+    shown = 1 - F.adaptive_avg_pool2d(target.holes[:, None].to(count), cells.grid).flatten(1)
+    return shown / shown.sum().clamp_min(1)
+
+
+def _direction_distance(cells: CellPrediction, target: PoseBatch, share: Tensor) -> Tensor:
     if cells.rays_world is None:  # the cells say quaternions, of which the loss sees the mean
         return cells.position_m.new_zeros(())
     true = rotate(target.quaternion[:, None], cells.rays_cam)
-    return torch.linalg.vector_norm(cells.rays_world - true, dim=-1).mean() / 2
+    return (share * torch.linalg.vector_norm(cells.rays_world - true, dim=-1)).sum() / 2
 
 
 def _point_distance(said_m: Tensor, grid: tuple[int, int], target: PoseBatch) -> Tensor:

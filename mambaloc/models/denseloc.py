@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, ClassVar, Literal, get_args
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from mambaloc.data.cameras import assumed_intrinsics
@@ -15,6 +14,7 @@ from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
 from mambaloc.nn import (
     Backbone,
+    CellDetail,
     CellHead,
     CellPosition,
     CellRotation,
@@ -31,18 +31,19 @@ Head = Literal["dense", "token"]
 
 
 class DenseLoc(PoseNetwork):
-    """Cells at one stride, each with what coarser maps say about it, a transformer over them, and a dense head.
+    """A transformer over the coarsest feature map, finer maps that add detail to its cells, and a dense head.
 
-    The camera enters only through the directions of the cells, so that a crop, a turned view or another lens is just
-    another pinhole matrix. Rays in place of a quaternion follow Cameras as Rays (Zhang et al. 2024).
+    Attention runs over the few coarse cells; the finest map, whose cells answer, costs only products of each cell by
+    itself. The camera enters only through the directions of the cells, so that a crop, a turned view or another lens is
+    just another pinhole matrix. Rays in place of a quaternion follow Cameras as Rays (Zhang et al. 2024).
 
     Args:
-        backbone: feature maps; the cells are those of the first, finest one.
+        backbone: feature maps, the finest first; its cells answer.
         image_size: (height, width) in pixels; fixes the position tables.
         dim: width of the encoder and of GIS.
-        encoder_layers: layers of the transformer over the cells.
+        encoder_layers: layers of the transformer over the coarsest map.
         heads: attention heads of each layer.
-        feedforward: hidden width of each layer's MLP.
+        feedforward: hidden width of each layer's MLP, and of the finest cells'.
         head_hidden: hidden width of the heads; None for linear ones.
         dropout: residual and MLP dropout of the encoder.
         head: ``dense``; or ``token``, the ablation that answers once, from the transformer's token.
@@ -78,9 +79,10 @@ class DenseLoc(PoseNetwork):
     ) -> None:
         super().__init__()
         self.backbone, self.image_size, self.is_dense = backbone, image_size, head == "dense"
-        self.grid = backbone.grids(image_size)[0]
-        channels = sum(backbone.channels)
-        self.encoder = TokenEncoder(channels, self.grid, dim, encoder_layers, heads, feedforward, dropout)
+        grids, (*finer, coarsest) = backbone.grids(image_size), backbone.channels
+        self.grid = grids[0]
+        self.encoder = TokenEncoder(coarsest, grids[-1], dim, encoder_layers, heads, feedforward, dropout)
+        self.detail = CellDetail(sum(finer), dim, feedforward) if finer and self.is_dense else None
         self.position_gis = build_gis(gis, dim, discretisation)
         self.orientation_gis = build_gis(gis, dim, discretisation)
         self.head = CellHead(dim, rotation, position, head_hidden) if self.is_dense else PoseHead(dim)
@@ -89,13 +91,13 @@ class DenseLoc(PoseNetwork):
 
     def features(self, feats: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Turn the feature maps into both branches' features of each cell; (B, N, dim) each, N = 1 for a token."""
-        size = feats[0].shape[-2:]
-        maps = [feats[0], *(F.interpolate(each, size, mode="bilinear", align_corners=False) for each in feats[1:])]
-        maps_BCHW = torch.cat(maps, dim=1)
         if not self.is_dense:
-            token_BD = self.encoder(maps_BCHW)
+            token_BD = self.encoder(feats[-1])
             return self.position_gis(token_BD), self.orientation_gis(token_BD)
-        cells_BND = self.encoder.cells(maps_BCHW).flatten(2).mT
+        cells_BDHW = self.encoder.cells(feats[-1])
+        if self.detail is not None:
+            cells_BDHW = self.detail(cells_BDHW, feats[:-1])
+        cells_BND = cells_BDHW.flatten(2).mT
         cells_MD = cells_BND.flatten(0, 1)
         position, orientation = (
             gis(cells_MD).unflatten(0, cells_BND.shape[:2]) for gis in (self.position_gis, self.orientation_gis)
@@ -117,7 +119,7 @@ class LitDenseLoc(LitPoseRegressor):
     """DenseLoc, trained on the error of the solved pose and of each cell, with learned weights.
 
     The arguments are those of :class:`DenseLoc` and of :class:`~mambaloc.models.base.LitPoseRegressor`, and
-    ``strides``: those of the feature maps that a cell sees; the first is the cells'.
+    ``strides``: those of the feature maps. The cells are those of the first, the transformer sees the last.
     """
 
     network: DenseLoc

@@ -1,7 +1,7 @@
 """Blocks that know no batch and no file."""
 
 from mambaloc.nn.backbone import Backbone, ImageBackbone, PooledBackbone
-from mambaloc.nn.cells import CellHead, CellPosition, CellRotation
+from mambaloc.nn.cells import CellDetail, CellHead, CellPosition, CellRotation
 from mambaloc.nn.encoder import TokenEncoder
 from mambaloc.nn.gis import GISMode, GlobalInformationSelector, build_gis
 from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation
@@ -10,6 +10,7 @@ from mambaloc.nn.ssm import Discretisation, MambaMixer, selective_scan
 
 __all__ = [
     "Backbone",
+    "CellDetail",
     "CellHead",
     "CellPosition",
     "CellRotation",

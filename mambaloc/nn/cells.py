@@ -1,4 +1,4 @@
-"""A dense head: every cell of the feature map answers, and the pose is solved from all of them."""
+"""A dense head and its cells: every cell of the feature map answers, and the pose is solved from all of them."""
 
 from __future__ import annotations
 
@@ -19,6 +19,39 @@ CellPosition = Literal["votes", "points"]
 """What a cell says of the position: the camera's centre; or that, and the scene point that it sees."""
 
 _VOTES_WEIGHT = 0.05  # of the mean vote, beside rays through points whose weights sum to 1
+
+
+class CellDetail(nn.Module):
+    """Cells of the finest feature map: what finer maps show there, beside the context that coarse cells have.
+
+    Args:
+        channels: of all finer maps together.
+        dim: width of the cells.
+        hidden: hidden width of the MLP that joins the two.
+
+    Shape:
+        context (B, dim, h, w), maps of (B, C, H, W), the finest first -> (B, dim, H, W) of the first map.
+    """
+
+    def __init__(self, channels: int, dim: int, hidden: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(channels, dim)
+        self.norm = nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, hidden), nn.GELU(), nn.Linear(hidden, dim))
+        self.norm_out = nn.LayerNorm(dim)
+
+    def forward(self, context_BDhw: Tensor, finer: list[Tensor]) -> Tensor:
+        """Add detail to the context, and let an MLP of each cell join them, around a residual."""
+        size = finer[0].shape[-2:]
+        maps_BCHW = torch.cat([_resized(each, size) for each in finer], dim=1)
+        context_BND = _resized(context_BDhw, size).flatten(2).mT
+        cells_BND = context_BND + self.project(maps_BCHW.flatten(2).mT)
+        cells_BND = self.norm_out(cells_BND + self.mlp(self.norm(cells_BND)))
+        return cells_BND.mT.unflatten(-1, size)
+
+
+def _resized(maps_BCHW: Tensor, size: torch.Size) -> Tensor:
+    return F.interpolate(maps_BCHW, size, mode="bilinear", align_corners=False)
 
 
 class CellHead(nn.Module):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from mambaloc.data.points import ScenePoints
 from mambaloc.errors import InputError
 from mambaloc.runtime.rotations import quaternion_from_matrix
 from mambaloc.synthesis import Views
+from mambaloc.types import PoseBatch
 
 
 class FramesAndViews(CachedFrames):
@@ -30,6 +33,7 @@ class FramesAndViews(CachedFrames):
     def __init__(self, real: CachedFrames, views: Views, share: float, points: ScenePoints | None = None) -> None:
         super().__init__(real.frames, real.images, real.cameras, real.points)
         self.views, self.share = views, share
+        self.resident_holes: Tensor | None = None
         pose = views.world_from_cam
         self.position_m = _joined(self.position_m, pose[:, :3, 3])
         self.quaternion = _joined(self.quaternion, quaternion_from_matrix(pose[:, :3, :3]))
@@ -47,6 +51,28 @@ class FramesAndViews(CachedFrames):
         """Pictures of some rows, frames' and views', (B, 3, H, W)."""
         count = len(self.frames)
         return np.stack([self.images[row] if row < count else self.views.images[row - count] for row in rows])
+
+
+    def to(self, device: torch.device) -> Self:
+        """Return the same frames and views, whole in a device's memory."""
+        there = super().to(device)
+        there.resident_holes = torch.from_numpy(self.holes(range(len(self.clips)))).to(device)
+        return there
+
+    def holes(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which pixels of some rows show nothing of the scene, (B, H, W): those of views without depth."""
+        holes = np.zeros((len(rows), *self.images.shape[2:]), dtype=bool)
+        for place, row in enumerate(rows):
+            if (view := row - len(self.frames)) >= 0:
+                np.isnan(self.views.depth_m[view], out=holes[place])
+        return holes
+
+    def __getitems__(self, items: list[int]) -> PoseBatch:
+        """Fetch frames and views: as frames are, and with ``holes`` (B, H, W)."""
+        batch = super().__getitems__(items)
+        if self.resident_holes is None:
+            return replace(batch, holes=torch.from_numpy(self.holes(items)))
+        return replace(batch, holes=self.resident_holes[batch.index])
 
 
 def _joined(real: Tensor, views: NDArray[np.floating]) -> Tensor:
