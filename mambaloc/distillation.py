@@ -129,6 +129,8 @@ class LitDistillation(LitStudent):
             raise InputError("model.teacher: distillation needs one; train any system, and name its checkpoint")
         if student.get("compile_mode"):
             raise InputError("model.compile_mode: steps with a teacher do not run compiled; set it to null")
+        if student.get("feature_cache_gib"):
+            raise InputError("model.feature_cache_gib: the teacher needs the images. Set it to 0.")
         super().__init__(**student)
         self.answers: Answers | None = None
 

@@ -136,3 +136,10 @@ def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
     finally:
         if partial is not None:
             shutil.rmtree(partial, ignore_errors=True)
+
+
+def claim_space(file: Path) -> None:
+    """Fill a sparse file's holes: writing into them through a memory map on a full disk is a bus error."""
+    if hasattr(os, "posix_fallocate"):
+        with file.open("r+b") as opened:
+            os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)

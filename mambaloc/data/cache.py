@@ -24,6 +24,7 @@ from rich.progress import track
 
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
+from mambaloc.files import claim_space
 from mambaloc.images import END_BYTES, decode_image, resized
 from mambaloc.user_cache import default_cache_dir
 
@@ -116,7 +117,7 @@ def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:
                 images = np.lib.format.open_memmap(
                     partial / "images.npy", mode="w+", dtype=np.uint8, shape=(len(paths), *frame.shape)
                 )
-                _claim_space(partial / "images.npy")
+                claim_space(partial / "images.npy")
             if frame.shape != images.shape[1:]:
                 bad.append((row, f"image is {_size(frame)} after resizing, where the first is {_size(images[0])}"))
                 continue
@@ -126,13 +127,6 @@ def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:
         images.flush()
     (partial / "meta.json").write_text(json.dumps({"rows": rows, "bad": bad, "short_side": short_side}))
     partial.replace(folder)
-
-
-def _claim_space(file: Path) -> None:
-    """Fill a sparse file's holes: writing into them through a memory map on a full disk is a bus error."""
-    if hasattr(os, "posix_fallocate"):
-        with file.open("r+b") as opened:
-            os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
 
 
 def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:

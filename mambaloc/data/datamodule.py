@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -46,6 +47,8 @@ class PoseDataModule(L.LightningDataModule):
             pose. ``rotation``: what a camera turned about its centre sees, whose pose is known exactly.
         rotation_deg: under ``rotation``, turns are uniform within so much, about each of the camera's axes.
         zoom: under ``rotation``, focal lengths vary from ``1 / (1 + zoom)`` to ``1 + zoom`` times the frame's.
+        augmentation_draws: augment each training image in so many ways, one an epoch in turn, in place of a new way
+            every epoch: features of frozen layers can then be kept.
         validation: how the best epoch is chosen, see :data:`~mambaloc.data.splits.Validation`; ``test_set`` selects on
             the test set and is reported as such.
         val_fraction: share of the training frames that is held out.
@@ -84,6 +87,7 @@ class PoseDataModule(L.LightningDataModule):
         augmentation: View = "crop",
         rotation_deg: float = 10.0,
         zoom: float = 0.0,
+        augmentation_draws: int | None = None,
         validation: Validation = "auto",
         val_fraction: float = 0.1,
         val_gap: int = 20,
@@ -111,6 +115,8 @@ class PoseDataModule(L.LightningDataModule):
         if augmentation not in ways:
             raise InputError(f"data.augmentation {augmentation!r}: choose one of {', '.join(ways)}")
         self.augmentation = ways[augmentation]
+        if augmentation_draws is not None and augmentation_draws < 1:
+            raise InputError(f"data.augmentation_draws {augmentation_draws}: must be 1 or more, or null")
         self._resident: dict[Split, CachedFrames] = {}
         self._uniforms: tuple[tuple[int, int, torch.device], Tensor] | None = None
 
@@ -166,6 +172,17 @@ class PoseDataModule(L.LightningDataModule):
         """Say which frames a number comes from: scene, counts, selection rule, what was left out and repaired."""
         return self.scene.describe()
 
+    def training_key(self) -> str:
+        """Name what augmented training images depend on: frames, views, chances and the batches they are mixed in."""
+        told = (
+            self.scene.training_key(),
+            self.augmentation,
+            self.jitter,
+            provenance.seed(),
+            self.hparams["batch_size"],
+        )
+        return hashlib.sha256(repr(told).encode()).hexdigest()
+
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         """Shuffled training batches; the first call makes views."""
         self.scene.add_views(self._device)
@@ -207,6 +224,8 @@ class PoseDataModule(L.LightningDataModule):
 
     def augmented(self, batch: PoseBatch, epoch: int) -> PoseBatch:
         """View and colour training images as chance has it, which depends on (seed, epoch, row) alone."""
+        if draws := self.hparams["augmentation_draws"]:
+            epoch %= draws
         uniform = self._epoch_uniforms(epoch, batch.index.device)[batch.index]
         view, color = uniform.tensor_split([self.augmentation.draws], dim=1)
         return self.augmentation(batch, self.jitter.matrices(batch.image, color), view)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from dataclasses import dataclass, replace
 from functools import partial
@@ -184,6 +185,14 @@ class Scene:
     def items(self, part: Split) -> CachedFrames:
         """What batches of a part are made of: its frames, and views beside those that are trained on."""
         return self._mixed if part == "train" and self._mixed else self.parts[part].data
+
+    def training_key(self) -> str:
+        """Name the images that are trained on: frames as they were decoded, and views."""
+        key = self.parts["train"].fingerprint
+        if self._mixed is None:
+            return key
+        poses = hashlib.sha256(self._mixed.views.world_from_cam.tobytes()).hexdigest()
+        return f"{key} {poses} {self._mixed.share}"
 
     def _made_views(self, device: torch.device) -> SceneViews | None:
         request = ViewRequest(self.views, self.view_depth, self.view_share, provenance.seed())

@@ -18,9 +18,10 @@ from mambaloc.losses import build_loss
 from mambaloc.memory import keep_freed_memory
 from mambaloc.metrics import PoseErrors
 from mambaloc.models.compiling import CompileMode, compile_forward
+from mambaloc.models.feature_cache import FeatureCache
 from mambaloc.models.optim import Schedule, build_adam, build_step_schedule, check_span, training_steps
 from mambaloc.models.weights import build_from, read_checkpoint, start_from
-from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale
+from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale, SplitBackbone
 from mambaloc.types import PoseBatch, PosePrediction, height_and_width
 
 BACKBONE_ARGUMENTS = {
@@ -60,6 +61,8 @@ class LitPoseRegressor(L.LightningModule):
             which replays CUDA graphs. It takes a minute or so before the first step, and before the first of another
             size, as an epoch's last may be; less where it was done before.
         frozen_groups: layer groups of the backbone, from the image on, that stay as they start, statistics included.
+        feature_cache_gib: keep what the frozen groups give for each augmented training image, so much of it at most, in
+            a file; the steps then begin after them. It needs ``data.augmentation_draws``. 0 keeps nothing.
         frozen_statistics: normalise by the statistics that the backbone starts with, in all of it: for one trained on
             many more images than the scene has.
         lr: learning rate of Adam, or its highest value.
@@ -89,6 +92,7 @@ class LitPoseRegressor(L.LightningModule):
         loss_args: dict[str, Any] | None = None,
         compile_mode: CompileMode | None = None,
         frozen_groups: int = 0,
+        feature_cache_gib: float = 0.0,
         frozen_statistics: bool = False,
         lr: float = 1e-4,
         weight_decay: float = 1e-4,
@@ -105,8 +109,11 @@ class LitPoseRegressor(L.LightningModule):
             raise InputError(f"model.schedule {schedule!r}: choose one of {', '.join(get_args(Schedule))}")
         if compile_mode not in (None, *get_args(CompileMode)):
             raise InputError(f"model.compile_mode {compile_mode!r}: choose one of {', '.join(get_args(CompileMode))}")
+        if feature_cache_gib and compile_mode:
+            raise InputError("model.feature_cache_gib: its steps do not run compiled. Set compile_mode to null.")
         self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode
         self._compiled: Callable[..., PosePrediction] | None = None
+        self._split: tuple[SplitBackbone, FeatureCache] | None = None
         self.val_errors, self.test_errors = PoseErrors(), PoseErrors()
         self.provenance: dict[str, Any] = {}
         self.save_hyperparameters()
@@ -152,9 +159,16 @@ class LitPoseRegressor(L.LightningModule):
             accumulated = self.trainer.accumulate_grad_batches
             self._compiled = compile_forward(self.network, self.compile_mode, accumulated)
 
+    def on_train_start(self) -> None:
+        """Open the cache of frozen features, now that the training images, views among them, are known."""
+        if most_gib := self.hparams["feature_cache_gib"]:
+            split = SplitBackbone(self.network.backbone, self.image_size)
+            data = self.scene_for("feature_cache_gib")
+            self._split = split, FeatureCache.of_training(data, split, self.device, int(most_gib * 2**30))
+
     def teardown(self, stage: str) -> None:
-        """Let go of what was compiled: checkpoints and copies know nothing of it."""
-        self._compiled = None
+        """Let go of what only training needs: checkpoints and copies know nothing of it."""
+        self._compiled = self._split = None
 
     def scene_for(self, argument: str) -> Any:
         """Return the trainer's data module, of which an argument asks more than batches.
@@ -177,7 +191,12 @@ class LitPoseRegressor(L.LightningModule):
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
         """Return the loss of a batch; auxiliary heads weigh 0.3 each (Szegedy et al. 2015)."""
-        prediction = (self._compiled or self)(batch.image, batch.intrinsics)
+        if self._split is None:
+            prediction = (self._compiled or self)(batch.image, batch.intrinsics)
+        else:
+            split, cache = self._split
+            feats = split.trained(cache(batch, self.current_epoch))
+            prediction = self.network.forward_head(self.network.features(feats), batch.intrinsics)
         loss = self.loss(prediction, batch)
         for auxiliary in prediction.auxiliary:
             loss = loss + 0.3 * self.loss(auxiliary, batch)

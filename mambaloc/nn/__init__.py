@@ -3,6 +3,7 @@
 from mambaloc.nn.backbone import Backbone, ImageBackbone, PooledBackbone
 from mambaloc.nn.cells import CellDetail, CellHead, CellPosition, CellRotation
 from mambaloc.nn.encoder import TokenEncoder
+from mambaloc.nn.frozen import SplitBackbone
 from mambaloc.nn.gis import GISMode, GlobalInformationSelector, build_gis
 from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation
 from mambaloc.nn.network import PoseNetwork
@@ -25,6 +26,7 @@ __all__ = [
     "PositionScale",
     "RegressionHead",
     "Rotation",
+    "SplitBackbone",
     "TokenEncoder",
     "build_gis",
     "selective_scan",

@@ -148,6 +148,26 @@ def test_frozen_groups_stay_as_they_start(scenes):
     assert changed == {"layer2", "layer3"}  # groups 0 and 1 are the stem and layer1; their statistics, too, stayed
 
 
+def test_kept_features_train_as_computed_ones(scenes, tmp_path):
+    model = {"frozen_groups": 2, "frozen_statistics": True, "lr": 1e-4}
+    data = {"augmentation_draws": 2, "augmentation": "rotation", "cache_dir": str(tmp_path)}
+    computed = fit(scenes, model, data, max_epochs=4)[1].losses
+    kept = fit(scenes, {**model, "feature_cache_gib": 0.1}, data, max_epochs=4)[1].losses
+    assert kept == pytest.approx(computed, rel=1e-3)  # kept in half precision
+    again = fit(scenes, {**model, "feature_cache_gib": 0.1}, data, max_epochs=4)[1].losses
+    assert again == kept
+    assert len(list(tmp_path.glob("features/*/features.npy"))) == 1
+
+
+def test_features_of_ever_new_augmentations_are_not_kept(scenes):
+    with pytest.raises(InputError, match=r"model\.feature_cache_gib: .*Set data\.augmentation_draws"):
+        fit(scenes, {"frozen_groups": 2, "feature_cache_gib": 0.1}, max_epochs=1)
+    with pytest.raises(InputError, match=r"model\.frozen_groups 0: .* has no frozen features to keep"):
+        fit(scenes, {"feature_cache_gib": 0.1}, {"augmentation_draws": 2}, max_epochs=1)
+    with pytest.raises(InputError, match=r"data\.augmentation_draws 0: must be 1 or more, or null"):
+        fit(scenes, data={"augmentation_draws": 0}, max_epochs=1)
+
+
 def test_frozen_statistics_stay_while_weights_change(scenes):
     L.seed_everything(3, verbose=False)
     start = create_model("mambaloc", image_size=32, **SMALL).network.backbone.model.state_dict()

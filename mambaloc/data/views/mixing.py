@@ -52,7 +52,6 @@ class FramesAndViews(CachedFrames):
         count = len(self.frames)
         return np.stack([self.images[row] if row < count else self.views.images[row - count] for row in rows])
 
-
     def to(self, device: torch.device) -> Self:
         """Return the same frames and views, whole in a device's memory."""
         there = super().to(device)
