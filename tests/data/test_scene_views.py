@@ -156,7 +156,7 @@ def test_resident_and_loaded_by_workers_batches_are_the_same(make):
         make(points_per_frame=16, **how).train_dataloader() for how in ({}, {"resident": True}, {"num_workers": 2})
     ]
     for batches in zip(*loaders, strict=True):
-        for name in ("image", "position_m", "quaternion", "index", "points_m", "intrinsics"):
+        for name in ("image", "position_m", "quaternion", "index", "points_m", "intrinsics", "holes"):
             first, *others = (getattr(batch, name) for batch in batches)
             for other in others:
                 torch.testing.assert_close(other, first, rtol=0, atol=0, equal_nan=True)

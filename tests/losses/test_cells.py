@@ -82,6 +82,17 @@ def test_points_are_compared_where_there_are_any():
     assert loss(replace(prediction, cells=cells), no_points).item() == pytest.approx(without, abs=1e-5)
 
 
+def test_a_cell_counts_as_much_as_it_shows_of_the_scene():
+    target, turned = batch()
+    holes = torch.zeros(2, *SIZE, dtype=torch.bool)
+    holes[0, :, :16], holes[1, :8, :16] = True, True  # a column of cells; and half of the first cell
+    target, loss = replace(target, points_m=None, holes=holes), CellWeights(s_position=0.0, s_rotation=0.0)
+    prediction, moved_m = perfect(target, turned), torch.zeros(2, 12, 3)
+    moved_m[:, 0, 0] = 7.0  # the first cell of both
+    cells = replace(prediction.cells, position_m=prediction.cells.position_m + moved_m)
+    assert loss(replace(prediction, cells=cells), target).item() == pytest.approx(7.0 * 0.5 / (9 + 11.5), abs=1e-4)
+
+
 def test_a_system_without_cells_is_an_error():
     target, turned = batch()
     with pytest.raises(ValueError, match="needs a dense head"):
