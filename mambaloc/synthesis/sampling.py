@@ -32,8 +32,8 @@ class Spread:
         crowd_deg: and turned by less than this.
     """
 
-    noise: float = 0.1
-    noise_deg: float = 10.0
+    noise: float = 0.2
+    noise_deg: float = 20.0
     between: float = 0.5
     between_deg: float = 40.0
     crowd: float = 0.1

@@ -23,10 +23,10 @@ from mambaloc.synthesis.splatting import Splatter
 PART = 256
 """Views are kept so many at a time, so that an interrupted run goes on where it was."""
 
-MOST_HOLES = 0.25
+MOST_HOLES = 0.5
 """Share of a view's pixels that no frame sees, beyond which it is thrown away."""
 
-_VERSION = 3
+_VERSION = 4
 _NEAREST = 0.1  # median depths; nearer surfaces would fill the view with a few pixels of a frame
 _MOST_CROWDED = 0.02  # share of pixels nearer than that
 _DRAWN = 64  # poses at once
