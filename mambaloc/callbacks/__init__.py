@@ -4,6 +4,7 @@ from mambaloc.callbacks.early_stopping import EarlyStopping
 from mambaloc.callbacks.map_build import MapBuild
 from mambaloc.callbacks.onnx_export import OnnxExport
 from mambaloc.callbacks.progress import PoseProgressBar
+from mambaloc.callbacks.time_budget import TimeBudget
 from mambaloc.callbacks.trajectory_plot import TrajectoryPlot
 from mambaloc.callbacks.view_sheet import ViewSheet
 from mambaloc.callbacks.wall_clock import WallClock
@@ -14,6 +15,7 @@ __all__ = [
     "MapBuild",
     "OnnxExport",
     "PoseProgressBar",
+    "TimeBudget",
     "TrajectoryPlot",
     "ViewSheet",
     "WallClock",

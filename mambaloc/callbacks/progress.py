@@ -12,7 +12,10 @@ _DRAWN_EVERY_S = 0.1
 
 
 class PoseProgressBar(RichProgressBar):
-    """Rich progress bar that shows the latest validation medians in metres and degrees, drawn ten times a second."""
+    """Rich progress bar that shows the latest validation medians in metres and degrees, drawn ten times a second.
+
+    Under a time budget it also shows the seconds left.
+    """
 
     _drawn_s = 0.0
 
@@ -33,6 +36,8 @@ class PoseProgressBar(RichProgressBar):
         shown: dict[str, int | str | float | dict[str, float]] = {}
         if "train/loss" in metrics:
             shown["loss"] = f"{metrics['train/loss'].item():.3f}"
+        if "time/left_s" in metrics:
+            shown["left"] = f"{max(0.0, metrics['time/left_s'].item()):.0f} s"
         if "val/position_error_m" in metrics:
             medians = metrics["val/position_error_m"].item(), metrics["val/rotation_error_deg"].item()
             shown["val"] = "{:.3f} m {:.2f} deg".format(*medians)

@@ -1,0 +1,85 @@
+"""Training for so many minutes, whatever the machine."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import lightning as L
+
+from mambaloc.errors import InputError
+
+_RISE = 0.3  # share of the time in which the learning rate rises
+_LOWEST, _LAST = 1 / 25, 1 / 250_000  # of the highest, where it begins and where it ends
+_STARTED = time.monotonic()
+
+
+class TimeBudget(L.Callback):
+    """Train for so many minutes of the command, under one cycle of the learning rate over the time that is left to it.
+
+    Map, views and whatever else precedes the first step are part of the budget, and so is a reserve for tests and
+    export. Steps then differ from run to run, and so does the network: for figures that others are to reach, set
+    ``trainer.max_steps``. Recipes leave ``model.schedule`` at ``step`` under a budget; the cycle (Smith and Topin 2018)
+    replaces it, and ``model.lr`` is its highest value. A resumed run has a budget of its own.
+
+    Args:
+        minutes: from the start of the command; None trains as the trainer says.
+        reserve_s: seconds of them for tests and export at the end.
+
+    Raises:
+        InputError: for a budget that leaves no time to train.
+    """
+
+    def __init__(self, minutes: float | None = None, reserve_s: float = 15.0) -> None:
+        if minutes is not None and not reserve_s < 60 * minutes < math.inf:
+            raise InputError(
+                f"time_budget.minutes {minutes:g}: must be more than the {reserve_s:g} s of time_budget.reserve_s"
+            )
+        self.minutes, self.reserve_s = minutes, reserve_s
+        self._began = self._ends = 0.0
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take what the start has left of the budget.
+
+        Raises:
+            InputError: where nothing is left.
+        """
+        if self.minutes is None:
+            return
+        self._began, self._ends = time.monotonic(), _STARTED + 60 * self.minutes - self.reserve_s
+        if self._ends <= self._began:
+            raise InputError(
+                f"time_budget.minutes {self.minutes:g}: {self._began - _STARTED:.0f} s went by before the first step. "
+                "Give more; frames, map and views are kept for the next run."
+            )
+        self._highest = [group["lr"] for group in trainer.optimizers[0].param_groups]
+
+    def on_train_batch_start(self, trainer: L.Trainer, *_: Any) -> None:
+        """Set the learning rate that belongs to this time."""
+        if self.minutes is None:
+            return
+        factor = one_cycle((time.monotonic() - self._began) / (self._ends - self._began))
+        for group, highest in zip(trainer.optimizers[0].param_groups, self._highest, strict=True):
+            group["lr"] = highest * factor
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """Stop once the time is over."""
+        if self.minutes is None:
+            return
+        left_s = self._ends - time.monotonic()
+        pl_module.log("time/left_s", left_s, logger=False)
+        if left_s <= 0:
+            trainer.should_stop = True
+
+
+def one_cycle(share: float) -> float:
+    """Learning rate as a factor of the highest, at a share of the training, as PyTorch's ``OneCycleLR`` has it."""
+    share = min(max(share, 0.0), 1.0)
+    if share < _RISE:
+        return _between(_LOWEST, 1.0, share / _RISE)
+    return _between(1.0, _LAST, (share - _RISE) / (1 - _RISE))
+
+
+def _between(start: float, end: float, way: float) -> float:
+    return end + (start - end) * (1 + math.cos(math.pi * way)) / 2

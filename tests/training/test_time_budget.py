@@ -1,0 +1,75 @@
+"""Training for so many minutes."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mambaloc.callbacks import PoseProgressBar, TimeBudget, time_budget
+from mambaloc.callbacks.time_budget import one_cycle
+from mambaloc.cli import main
+from mambaloc.errors import InputError
+from mambaloc.models.weights import read_checkpoint
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that a test moves by hand; the command began at 0."""
+    now = SimpleNamespace(s=0.0)
+    monkeypatch.setattr(time_budget, "_STARTED", 0.0)
+    monkeypatch.setattr(time_budget.time, "monotonic", lambda: now.s)
+    return now
+
+
+def test_the_cycle_is_pytorchs():
+    steps, highest = 201, 0.4
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, highest, steps, pct_start=0.3)
+    for step in range(steps):
+        if step:
+            optimizer.step()
+            schedule.step()
+        rise = 0.3 * steps - 1  # where theirs is highest
+        share = 0.3 * step / rise if step < rise else 0.3 + 0.7 * (step - rise) / (steps - 1 - rise)
+        assert highest * one_cycle(share) == pytest.approx(optimizer.param_groups[0]["lr"], rel=1e-6, abs=1e-9)
+
+
+def test_the_time_before_the_first_step_and_the_reserve_are_part_of_the_budget(clock):
+    logged = {}
+    module = SimpleNamespace(log=lambda name, value, **_: logged.update({name: value}))
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.5)
+    trainer = SimpleNamespace(optimizers=[optimizer], should_stop=False)
+    budget, rates = TimeBudget(minutes=2, reserve_s=20), []
+    clock.s = 40.0  # a map and views
+    budget.on_train_start(trainer, module)
+    for clock.s in (40.0, 58.0, 79.0, 99.0, 100.0):
+        budget.on_train_batch_start(trainer, module)
+        rates.append(optimizer.param_groups[0]["lr"])
+        assert not trainer.should_stop
+        budget.on_train_batch_end(trainer, module)
+    assert trainer.should_stop
+    assert rates[0] == pytest.approx(0.5 / 25)
+    assert rates[1] == pytest.approx(0.5)
+    assert rates[1] > rates[2] > rates[3] > rates[4] > 0
+    assert logged == {"time/left_s": 0.0}
+
+
+def test_a_budget_ends_a_run_that_has_no_other_end(tiny_recipe, tmp_path, monkeypatch):
+    monkeypatch.setattr(time_budget, "_STARTED", time_budget.time.monotonic())
+    options = ["--trainer.max_epochs", "-1", "--time_budget.minutes", "0.1", "--time_budget.reserve_s", "0.5"]
+    main([str(tiny_recipe), *options, "--trainer.default_root_dir", str(tmp_path / "run")])
+    assert read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")["global_step"] > 5
+    assert (tmp_path / "run/evaluation/last/metrics.json").is_file()
+
+
+def test_a_budget_that_is_used_up_before_the_first_step(clock):
+    clock.s = 61.0
+    with pytest.raises(InputError, match=r"time_budget\.minutes 1: 61 s went by before the first step\. Give more"):
+        TimeBudget(minutes=1).on_train_start(SimpleNamespace(), SimpleNamespace())
+    with pytest.raises(InputError, match=r"time_budget\.minutes 0.2: must be more than the 15 s of"):
+        TimeBudget(minutes=0.2)
+
+
+def test_the_progress_bar_shows_the_seconds_left():
+    trainer = SimpleNamespace(callback_metrics={"time/left_s": torch.tensor(34.6)})
+    assert PoseProgressBar().get_metrics(trainer, SimpleNamespace()) == {"left": "35 s"}
