@@ -170,7 +170,8 @@ class RecipeCLI(LightningCLI):
                 for each in found
             ]
         )
-        files = [f"evaluation/{found[0].path.stem}/trajectory.png", "model.onnx", "checkpoints", "config.yaml"]
+        exported = [name for name in ("model.onnx", "bundle") if (run_dir / name).exists()]
+        files = [f"evaluation/{found[0].path.stem}/trajectory.png", *exported, "checkpoints", "config.yaml"]
         print(f"wrote {run_dir}: {', '.join([str(RUN_MAP), *files] if beside else files)}")
 
 

@@ -1,27 +1,31 @@
-"""An ONNX file at the end of every training."""
+"""An ONNX file, or a whole bundle for apps, at the end of every training."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import lightning as L
 from lightning.pytorch.utilities import rank_zero_info
 
 from mambaloc.errors import InputError
-from mambaloc.export import contract_of, export_onnx
+from mambaloc.evaluation.with_map import RUN_MAP
+from mambaloc.export import contract_of, export_onnx, write_bundle
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.uncertainty import fit_uncertainty
 
 
 class OnnxExport(L.Callback):
-    """Export the best epoch's network, checked against PyTorch, to ``RUN/model.onnx``.
+    """Export the best epoch's network, checked against PyTorch, to ``RUN/model.onnx``; or to a bundle, with the map.
 
     Args:
         enabled: whether to.
+        bundle: write ``RUN/bundle`` in place of ``RUN/model.onnx``: the model, the run's map, and test vectors, as
+            ``tools/export.py`` does. A resumed run replaces it.
     """
 
-    def __init__(self, enabled: bool = True) -> None:
-        self.enabled = enabled
+    def __init__(self, enabled: bool = True, bundle: bool = False) -> None:
+        self.enabled, self.bundle = enabled, bundle
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Export; the last epoch where no best one was kept."""
@@ -29,9 +33,20 @@ class OnnxExport(L.Callback):
             return
         assert isinstance(pl_module, LitPoseRegressor)
         best = getattr(trainer.checkpoint_callback, "best_model_path", "")
-        path = Path(trainer.default_root_dir) / "model.onnx"
+        run = Path(trainer.default_root_dir)
         system = Checkpoint.read(best).system() if best else pl_module
         data = trainer.datamodule  # type: ignore[attr-defined]
+        if self.bundle:
+            shutil.rmtree(run / "bundle", ignore_errors=True)
+            found = run / RUN_MAP if (run / RUN_MAP).is_file() else None
+            written = write_bundle(system, data, run / "bundle", ("onnx",), sparse_map=found)
+            model = written.deviations[0]
+            rank_zero_info(
+                f"{run / 'bundle'}: {'model and map' if found else 'model alone'}; the model is within "
+                f"{model.position_mm:.1e} mm and {model.rotation_deg:.1e} deg of PyTorch"
+            )
+            return
+        path = run / "model.onnx"
         try:
             uncertainty, told = fit_uncertainty(system, data), "tells how sure it is"
         except InputError as error:

@@ -12,11 +12,10 @@ from mambaloc.errors import InputError
 
 _RISE = 0.3  # share of the time in which the learning rate rises
 _LOWEST, _LAST = 1 / 25, 1 / 250_000  # of the highest, where it begins and where it ends
-_STARTED = time.monotonic()
 
 
 class TimeBudget(L.Callback):
-    """Train for so many minutes of the command, under one cycle of the learning rate over the time that is left to it.
+    """Train for so many minutes, under one cycle of the learning rate over the time that is left to it.
 
     Map, views and whatever else precedes the first step are part of the budget, and so is a reserve for tests and
     export. Steps then differ from run to run, and so does the network: for figures that others are to reach, set
@@ -24,7 +23,7 @@ class TimeBudget(L.Callback):
     replaces it, and ``model.lr`` is its highest value. A resumed run has a budget of its own.
 
     Args:
-        minutes: from the start of the command; None trains as the trainer says.
+        minutes: from now on, before any frame is read; None trains as the trainer says.
         reserve_s: seconds of them for tests and export at the end.
 
     Raises:
@@ -37,6 +36,7 @@ class TimeBudget(L.Callback):
                 f"time_budget.minutes {minutes:g}: must be more than the {reserve_s:g} s of time_budget.reserve_s"
             )
         self.minutes, self.reserve_s = minutes, reserve_s
+        self._made = time.monotonic()
         self._began = self._ends = 0.0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -45,19 +45,19 @@ class TimeBudget(L.Callback):
         Raises:
             InputError: where nothing is left.
         """
-        if self.minutes is None:
+        if self.minutes is None or trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
-        self._began, self._ends = time.monotonic(), _STARTED + 60 * self.minutes - self.reserve_s
+        self._began, self._ends = time.monotonic(), self._made + 60 * self.minutes - self.reserve_s
         if self._ends <= self._began:
             raise InputError(
-                f"time_budget.minutes {self.minutes:g}: {self._began - _STARTED:.0f} s went by before the first step. "
-                "Give more; frames, map and views are kept for the next run."
+                f"time_budget.minutes {self.minutes:g}: {self._began - self._made:.0f} s went by before the first "
+                "step. Give more; frames, map and views are kept for the next run."
             )
         self._highest = [group["lr"] for group in trainer.optimizers[0].param_groups]
 
     def on_train_batch_start(self, trainer: L.Trainer, *_: Any) -> None:
         """Set the learning rate that belongs to this time."""
-        if self.minutes is None:
+        if not self._ends:
             return
         factor = one_cycle((time.monotonic() - self._began) / (self._ends - self._began))
         for group, highest in zip(trainer.optimizers[0].param_groups, self._highest, strict=True):
@@ -65,7 +65,7 @@ class TimeBudget(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
         """Stop once the time is over."""
-        if self.minutes is None:
+        if not self._ends:
             return
         left_s = self._ends - time.monotonic()
         pl_module.log("time/left_s", left_s, logger=False)
