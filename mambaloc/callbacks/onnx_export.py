@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 
 import lightning as L
-from lightning.pytorch.utilities import rank_zero_info
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation.with_map import RUN_MAP
@@ -41,7 +40,7 @@ class OnnxExport(L.Callback):
             found = run / RUN_MAP if (run / RUN_MAP).is_file() else None
             written = write_bundle(system, data, run / "bundle", ("onnx",), sparse_map=found)
             model = written.deviations[0]
-            rank_zero_info(
+            print(
                 f"{run / 'bundle'}: {'model and map' if found else 'model alone'}; the model is within "
                 f"{model.position_mm:.1e} mm and {model.rotation_deg:.1e} deg of PyTorch"
             )
@@ -52,4 +51,4 @@ class OnnxExport(L.Callback):
         except InputError as error:
             uncertainty, told = None, f"tells no uncertainty: {error}"
         parity = export_onnx(system, path, contract_of(system, data.hparams, uncertainty), uncertainty)
-        rank_zero_info(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch; {told}")
+        print(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch; {told}")

@@ -1,4 +1,4 @@
-"""Training for so many minutes."""
+"""Training for so many minutes, and the bundle that it ends with."""
 
 from types import SimpleNamespace
 
@@ -10,6 +10,7 @@ from mambaloc.callbacks.time_budget import one_cycle
 from mambaloc.cli import main
 from mambaloc.errors import InputError
 from mambaloc.models.weights import read_checkpoint
+from mambaloc.runtime.bundle import verify_bundle
 
 
 @pytest.fixture
@@ -71,3 +72,17 @@ def test_a_budget_that_is_used_up_before_the_first_step(clock):
 def test_the_progress_bar_shows_the_seconds_left():
     trainer = SimpleNamespace(callback_metrics={"time/left_s": torch.tensor(34.6)})
     assert PoseProgressBar().get_metrics(trainer, SimpleNamespace()) == {"left": "35 s"}
+
+
+def test_a_run_ends_with_a_bundle_of_model_and_map(tiny_recipe, den, tmp_path):
+    options = ["--data.root", str(den), "--data.scene", "den", "--data.validation", "none"]
+    options += ["--map.enabled", "true", "--map.width", "160", "--map.key_frames", "30"]
+    options += ["--onnx_export.enabled", "true", "--onnx_export.bundle", "true"]
+    run = tmp_path / "run"
+    main([str(tiny_recipe), *options, "--trainer.max_epochs", "1", "--trainer.default_root_dir", str(run)])
+    assert {each.file for each in verify_bundle(run / "bundle") if each.within} == {"model.onnx", "map.safetensors"}
+    (run / "bundle" / "old").write_text("of an earlier run")
+    last = str(run / "checkpoints/last.ckpt")
+    main([str(tiny_recipe), *options, "--trainer.max_epochs", "2", "--ckpt_path", last])
+    assert not (run / "bundle" / "old").exists()
+    assert not (run / "model.onnx").exists()
