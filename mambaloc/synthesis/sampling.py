@@ -24,16 +24,19 @@ class Spread:
     """How far views lie from the frames; lengths are in median depths of the scene, so any unit of the poses will do.
 
     Args:
-        noise: standard deviation of each coordinate.
-        noise_deg: standard deviation of the turn about each axis of the camera.
+        noise: standard deviation of each coordinate, of the nearer half of the views,
+        noise_deg: and of the turn about each axis of the camera;
+        far: of the other half both are so many times larger. Near ones give accuracy where the camera went; far ones
+            teach it to answer where hardly a frame shows what it sees.
         between: views lie between two frames that are closer than this,
         between_deg: and turned by less than this.
         crowd: a frame counts as often as one over how many frames are closer than this,
         crowd_deg: and turned by less than this.
     """
 
-    noise: float = 0.2
-    noise_deg: float = 20.0
+    noise: float = 0.1
+    noise_deg: float = 10.0
+    far: float = 2.0
     between: float = 0.5
     between_deg: float = 40.0
     crowd: float = 0.1
@@ -41,7 +44,8 @@ class Spread:
 
 
 class PoseSampler:
-    """Draws poses: one of the frames' or, as often, a point between two of them, plus normal noise.
+    """Draws poses: one of the frames' or, as often, a point between two of them, plus normal noise of one
+    of two sizes.
 
     Args:
         world_from_cam: of the frames, (N, 4, 4).
@@ -68,8 +72,9 @@ class PoseSampler:
         turn = quaternion_from_rotation_vector(
             way * rotation_vector_between(self.quaternion[first], self.quaternion[second])
         )
-        noise_rad = np.radians(self.spread.noise_deg) * rng.standard_normal((count, 3))
+        reach = np.where(rng.uniform(size=(count, 1)) < 0.5, self.spread.far, 1.0)
+        noise_rad = reach * np.radians(self.spread.noise_deg) * rng.standard_normal((count, 3))
         quaternion = multiply(multiply(self.quaternion[first], turn), quaternion_from_rotation_vector(noise_rad))
         position_m = (1 - way) * self.position_m[first] + way * self.position_m[second]
-        position_m += self.spread.noise * self.scale_m * rng.standard_normal((count, 3))
+        position_m += reach * self.spread.noise * self.scale_m * rng.standard_normal((count, 3))
         return rigid_transforms(matrix_from_quaternion(quaternion), position_m)

@@ -26,7 +26,7 @@ PART = 256
 MOST_HOLES = 0.5
 """Share of a view's pixels that no frame sees, beyond which it is thrown away."""
 
-_VERSION = 4
+_VERSION = 5
 _NEAREST = 0.1  # median depths; nearer surfaces would fill the view with a few pixels of a frame
 _MOST_CROWDED = 0.02  # share of pixels nearer than that
 _DRAWN = 64  # poses at once
