@@ -93,7 +93,7 @@ def forward(system: LitPoseRegressor, frames: PoseBatch) -> Callable[[], object]
     def call() -> object:
         system.eval()
         with torch.inference_mode():
-            return system(frames.image)
+            return system(frames.image, frames.intrinsics)
 
     return call
 
@@ -106,7 +106,7 @@ def training_step(system: LitPoseRegressor, frames: PoseBatch) -> Callable[[], o
         system.train()
         system.loss.train(frames.clip_length > 1)  # a single image has no relative pose, which only training refuses
         optimizer.zero_grad()
-        system.loss(system(frames.image), frames).backward()
+        system.loss(system(frames.image, frames.intrinsics), frames).backward()
         optimizer.step()
 
     return call

@@ -73,10 +73,10 @@ def _heatmaps(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
     batch, rows = _same_frames(trained, frames), []
     for each in trained:
         with torch.no_grad():
-            prediction = each.system(batch.image)
+            prediction = each.system(batch.image, batch.intrinsics)
         errors_m = position_error_m(prediction.position_m, batch.position_m)
         errors_deg = rotation_error_deg(prediction.quaternion, batch.quaternion)
-        maps = heat_maps(each.system.network, batch.image)
+        maps = heat_maps(each.system.network, batch.image, batch.intrinsics)
         rows.append(BranchHeat(_beside(each), *maps, errors_m, errors_deg))
     path = out / "heatmaps.png"
     with writing(out):

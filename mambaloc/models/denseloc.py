@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -56,8 +56,6 @@ class DenseLoc(PoseNetwork):
         (B, 3, H, W) in 0..1, intrinsics (B, 3, 3) in pixels -> :class:`~mambaloc.types.PosePrediction`.
     """
 
-    takes_intrinsics: ClassVar[bool] = True
-
     default_intrinsics: Tensor
     """(3, 3): those of the training cameras, which are used where none are given."""
 
@@ -79,6 +77,7 @@ class DenseLoc(PoseNetwork):
     ) -> None:
         super().__init__()
         self.backbone, self.image_size, self.is_dense = backbone, image_size, head == "dense"
+        self.takes_intrinsics = self.is_dense  # the token's answer has no camera in it
         grids, (*finer, coarsest) = backbone.grids(image_size), backbone.channels
         self.grid = grids[0]
         self.encoder = TokenEncoder(coarsest, grids[-1], dim, encoder_layers, heads, feedforward, dropout)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +23,7 @@ class PoseNetwork(nn.Module):
         (B, 3, H, W) in 0..1 -> :class:`~mambaloc.types.PosePrediction`.
     """
 
-    takes_intrinsics: ClassVar[bool] = False
+    takes_intrinsics: bool = False
     """Whether the pose depends on the camera; other networks are given its intrinsics and leave them unread."""
 
     default_intrinsics: Tensor

@@ -38,7 +38,7 @@ class Reading(NamedTuple):
     gradient: Tensor
 
 
-def readings(network: PoseNetwork, image: Tensor) -> tuple[Reading, Reading]:
+def readings(network: PoseNetwork, image: Tensor, intrinsics: Tensor | None = None) -> tuple[Reading, Reading]:
     """Return what the position branch and the orientation branch read of images.
 
     Of a backbone's maps a branch reads the deepest one that its answer depends on: in TransPoseNet stride 16 for the
@@ -53,12 +53,13 @@ def readings(network: PoseNetwork, image: Tensor) -> tuple[Reading, Reading]:
     Args:
         network: in evaluation mode, where no frame sees another.
         image: (B, 3, H, W) in 0..1.
+        intrinsics: (B, 3, 3) in pixels of it; the training camera's unless given.
 
     Raises:
         InputError: for a backbone without a map, such as a vision transformer.
     """
     with torch.enable_grad(), _listening(network.backbone) as maps:
-        prediction = network(image.detach().requires_grad_())
+        prediction = network(image.detach().requires_grad_(), intrinsics)
         answers = (
             network.head.position_scale.normalise(prediction.position_m),
             log_from_quaternion(prediction.quaternion),
@@ -81,12 +82,12 @@ def grad_cam(reading: Reading) -> Tensor:
     return cam_BHW / cam_BHW.amax((-2, -1), keepdim=True).clamp_min(torch.finfo(cam_BHW.dtype).tiny)
 
 
-def heat_maps(network: PoseNetwork, image: Tensor) -> tuple[Tensor, Tensor]:
+def heat_maps(network: PoseNetwork, image: Tensor, intrinsics: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return the position and the orientation branch's heat maps of images, (B, rows, columns) in 0..1 each.
 
     The arguments and the errors are those of :func:`readings`.
     """
-    position, orientation = readings(network, image)
+    position, orientation = readings(network, image, intrinsics)
     return grad_cam(position), grad_cam(orientation)
 
 
