@@ -53,7 +53,8 @@ class TimeBudget(L.Callback):
                 f"time_budget.minutes {self.minutes:g}: {self._began - self._made:.0f} s went by before the first "
                 "step. Give more; frames, map and views are kept for the next run."
             )
-        self._highest = [group["lr"] for group in trainer.optimizers[0].param_groups]
+        groups = trainer.optimizers[0].param_groups  # of a resumed run they are where the last cycle ended
+        self._highest = [group.get("initial_lr", group["lr"]) for group in groups]
 
     def on_train_batch_start(self, trainer: L.Trainer, *_: Any) -> None:
         """Set the learning rate that belongs to this time."""
@@ -69,7 +70,7 @@ class TimeBudget(L.Callback):
             return
         left_s = self._ends - time.monotonic()
         pl_module.log("time/left_s", left_s, logger=False)
-        if left_s <= 0:
+        if trainer.strategy.broadcast(left_s <= 0):  # all devices stop after the same step
             trainer.should_stop = True
 
 

@@ -38,7 +38,9 @@ def test_the_time_before_the_first_step_and_the_reserve_are_part_of_the_budget(c
     logged = {}
     module = SimpleNamespace(log=lambda name, value, **_: logged.update({name: value}))
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.5)
-    trainer = SimpleNamespace(optimizers=[optimizer], should_stop=False, fast_dev_run=0)
+    optimizer.param_groups[0].update(initial_lr=0.5, lr=1e-6)  # as a resumed run has it
+    alone = SimpleNamespace(broadcast=lambda value: value)
+    trainer = SimpleNamespace(optimizers=[optimizer], should_stop=False, fast_dev_run=0, strategy=alone)
     budget, rates = TimeBudget(minutes=2, reserve_s=20), []
     clock.s = 40.0  # a map and views
     budget.on_train_start(trainer, module)
