@@ -65,7 +65,7 @@ def _share_of_cells(cells: CellPrediction, target: PoseBatch) -> Tensor:
     """What each cell counts in a mean, (B, N) or one number: as much as it shows of the scene."""
     count = cells.rays_cam[..., 0]
     if target.holes is None:
-        return count.new_tensor(1 / count.numel())
+        return count.new_full((), 1 / count.numel())  # made on the device, which nothing waits for
     shown = 1 - F.adaptive_avg_pool2d(target.holes[:, None].to(count), cells.grid).flatten(1)
     return shown / shown.sum().clamp_min(1)
 
