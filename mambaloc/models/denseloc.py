@@ -81,7 +81,7 @@ class DenseLoc(PoseNetwork):
         grids, (*finer, coarsest) = backbone.grids(image_size), backbone.channels
         self.grid = grids[0]
         self.encoder = TokenEncoder(coarsest, grids[-1], dim, encoder_layers, heads, feedforward, dropout)
-        self.detail = CellDetail(sum(finer), dim, feedforward) if finer and self.is_dense else None
+        self.detail = CellDetail(sum(finer), self.grid, dim, feedforward) if finer and self.is_dense else None
         self.position_gis = build_gis(gis, dim, discretisation)
         self.orientation_gis = build_gis(gis, dim, discretisation)
         self.head = CellHead(dim, rotation, position, head_hidden) if self.is_dense else PoseHead(dim)

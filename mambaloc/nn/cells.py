@@ -26,6 +26,7 @@ class CellDetail(nn.Module):
 
     Args:
         channels: of all finer maps together.
+        grid: rows and columns of the finest map.
         dim: width of the cells.
         hidden: hidden width of the MLP that joins the two.
 
@@ -33,9 +34,10 @@ class CellDetail(nn.Module):
         context (B, dim, h, w), maps of (B, C, H, W), the finest first -> (B, dim, H, W) of the first map.
     """
 
-    def __init__(self, channels: int, dim: int, hidden: int) -> None:
+    def __init__(self, channels: int, grid: tuple[int, int], dim: int, hidden: int) -> None:
         super().__init__()
         self.project = nn.Linear(channels, dim)
+        self.places = nn.Parameter(torch.zeros(grid[0] * grid[1], dim))  # attention knows where; values do not say it
         self.norm = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(nn.Linear(dim, hidden), nn.GELU(), nn.Linear(hidden, dim))
         self.norm_out = nn.LayerNorm(dim)
@@ -45,7 +47,7 @@ class CellDetail(nn.Module):
         size = finer[0].shape[-2:]
         maps_BCHW = torch.cat([_resized(each, size) for each in finer], dim=1)
         context_BND = _resized(context_BDhw, size).flatten(2).mT
-        cells_BND = context_BND + self.project(maps_BCHW.flatten(2).mT)
+        cells_BND = context_BND + self.project(maps_BCHW.flatten(2).mT) + self.places
         cells_BND = self.norm_out(cells_BND + self.mlp(self.norm(cells_BND)))
         return cells_BND.mT.unflatten(-1, size)
 
