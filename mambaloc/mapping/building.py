@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,15 +16,15 @@ from numpy.typing import NDArray
 
 from mambaloc.console import progress
 from mambaloc.errors import InputError
-from mambaloc.images import Image, as_rgb, read_image
+from mambaloc.images import Image
 from mambaloc.mapping.choosing import bytes_each, most_useful
 from mambaloc.mapping.given_points import described
+from mambaloc.mapping.kept_parts import kept_keypoints, kept_matches, picture_name
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.structure import Structure, recover_structure
-from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps.drift import fit_drift
-from mambaloc.runtime.maps.features import Features, detect_features, quantized
+from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.sparse_map import SparseMap
 
 if TYPE_CHECKING:
@@ -115,13 +116,7 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
     key = frames.select(farthest_first(frames.world_from_cam, settings.key_frames))
     tracks = key.tracks if settings.points == COLMAP else None
     pairs = np.empty((0, 2), np.int64) if tracks else _pairs(scene, key)
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        features = _each(pool, lambda row: _features(key, row, settings.width), range(len(key)), "keypoints")
-        if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
-            raise InputError(
-                f"{scene}: its frames have {keypoints:.0f} keypoints each. Film texture, or enlarge width."
-            )
-        matches = _each(pool, lambda pair: match(features[pair[0]], features[pair[1]]), list(pairs), "matches")
+    features, matches = _searched(scene, key, pairs, settings.width, threads or os.cpu_count())
     if tracks:
         structure = described(tracks, features, key.world_from_cam)
     else:
@@ -171,16 +166,32 @@ def _pairs(scene: str, key: PosedFrames) -> Indices:
     return pairs
 
 
+def _searched(
+    scene: str, key: PosedFrames, pairs: Indices, width: int, threads: int | None
+) -> tuple[list[Features], list[Indices]]:
+    """Keypoints of key frames, and the matches of each pair; pairs are ordered by their first frame."""
+    names = [picture_name(image, width) for image in key.images]
+    others = np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, len(key))))
+
+    def searched(row: int) -> Features:
+        return kept_keypoints(key.images[row], width, names[row]).described(key.intrinsics[row])
+
+    def matched(row: int) -> list[Indices]:
+        rows = [row, *others[row]]
+        return kept_matches([features[each] for each in rows], [names[each] for each in rows])
+
+    with ThreadPoolExecutor(threads) as pool:
+        features = _each(pool, searched, range(len(key)), "keypoints")
+        if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
+            raise InputError(
+                f"{scene}: its frames have {keypoints:.0f} keypoints each. Film texture, or enlarge width."
+            )
+        matches = _each(pool, matched, range(len(key)), "matches")
+    return features, list(itertools.chain.from_iterable(matches))
+
+
 def _each(pool: ThreadPoolExecutor, work: Callable[[S], T], items: Sequence[S], name: str) -> list[T]:
     return list(progress(pool.map(work, items), name, len(items)))
-
-
-def _features(frames: PosedFrames, row: int, width: int) -> Features:
-    image = frames.images[row]
-    rgb = read_image(image) if isinstance(image, Path) else as_rgb(image)
-    if width > rgb.shape[1]:
-        raise InputError(f"width {width}: the pictures are {rgb.shape[1]} pixels wide. Give at most that.")
-    return detect_features(rgb, frames.intrinsics[row], width / rgb.shape[1])
 
 
 def _check_enough(scene: str, structure: Structure, least: int) -> None:
