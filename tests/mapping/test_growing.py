@@ -89,7 +89,7 @@ def test_sessions_are_removed_in_any_order(growths, part, walk):
     )
     assert left.is_seen.any(axis=1).all()
     _assert_same(remove_session(left, "third"), part)
-    with pytest.raises(InputError, match=r"second: was never added to the map of room\. What was added: third\."):
+    with pytest.raises(InputError, match=r"second: is not in the map of room\. Choose one of its sessions: third\."):
         remove_session(left, "second")
 
 
@@ -126,9 +126,9 @@ def test_what_is_added_has_a_budget(part, walk):
 
 def test_the_same_name_is_not_added_twice(growths, walk):
     grown = growths[False].sparse_map
-    with pytest.raises(InputError, match=r"second: was added before\. .* --name"):
+    with pytest.raises(InputError, match=r"second: is in the map already\. .* --name"):
         add_frames(grown, _new(grown, walk, ROWS[:2], False), "second", 20)
-    with pytest.raises(InputError, match=r"^poses: is a name that the map uses itself\. Give another --name\."):
+    with pytest.raises(InputError, match=r"^poses: is a name that the map itself uses\. Choose another --name\."):
         add_frames(grown, _new(grown, walk, ROWS[:2], False), "poses", 20)
 
 

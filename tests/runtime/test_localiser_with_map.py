@@ -108,7 +108,7 @@ def test_a_map_localises_without_a_network(map_of_den, frame):
     lost = localiser.localise(GREY)
     assert lost.source is None
     assert np.isnan(lost.position_m).all()
-    with pytest.raises(InputError, match="has another shape than the map's of 160x120"):
+    with pytest.raises(InputError, match="its shape differs from the map's pictures of 160x120"):
         localiser.localise(np.zeros((72, 72, 3), np.uint8))
 
 
