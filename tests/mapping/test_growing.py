@@ -214,7 +214,7 @@ def test_pictures_of_another_camera_are_refused_or_named(part, walk, tmp_path):
 
 def test_pictures_of_another_shape_need_their_camera(part, tmp_path):
     cv2.imwrite(str(tmp_path / "tall.png"), np.zeros((160, 120, 3), np.uint8))
-    with pytest.raises(InputError, match=r"picture of 120x160: has another shape .* Give its intrinsics"):
+    with pytest.raises(InputError, match=r"picture of 120x160: its shape differs .* Give its intrinsics"):
         read_new_frames(tmp_path, MapLocaliser(part))
 
 
