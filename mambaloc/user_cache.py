@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from filelock import FileLock
+from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.files import whole_folder
+from mambaloc.images import END_BYTES
+
+_ARRAYS = "arrays.npz"
 
 
 def default_cache_dir() -> Path:
@@ -41,3 +49,29 @@ def made_once(name: str, make: Callable[[Path], object]) -> Path:
     except OSError as error:
         raise InputError(f"{folder.parent}: cannot be written ({error.strerror}); {remedy}") from None
     return folder
+
+
+def arrays_made_once(name: str, make: Callable[[], dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Arrays by their names, kept in a folder of :func:`made_once`; nothing in it is ever unpickled.
+
+    Raises:
+        InputError: where the folder cannot be written, or its file is damaged.
+    """
+    file = made_once(name, lambda folder: np.savez(folder / _ARRAYS, **make())) / _ARRAYS  # type: ignore[arg-type]
+    try:
+        with np.load(file) as arrays:
+            return dict(arrays)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file}: is damaged ({error}). Remove {file.parent}, and it is made again.") from None
+
+
+def fingerprint(path: Path) -> bytes:
+    """Size, first and last bytes: a PNG's end holds its checksum, so any change of its pixels shows there."""
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            head = file.read(END_BYTES)
+            file.seek(max(0, size - END_BYTES))
+            return hashlib.sha256(f"{size}\0".encode() + head + file.read()).digest()
+    except OSError:
+        return b"missing"

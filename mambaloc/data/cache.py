@@ -25,8 +25,8 @@ from rich.progress import track
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
 from mambaloc.files import claim_space
-from mambaloc.images import END_BYTES, decode_image, resized
-from mambaloc.user_cache import default_cache_dir
+from mambaloc.images import decode_image, resized
+from mambaloc.user_cache import default_cache_dir, fingerprint
 
 _VERSION = 1
 
@@ -86,18 +86,6 @@ def _key(paths: Sequence[Path], short_side: int) -> str:
             digest.update(f"{path.parent.name}/{path.name}\0".encode())
             digest.update(content)
     return digest.hexdigest()[:32]
-
-
-def fingerprint(path: Path) -> bytes:
-    """Size, first and last bytes: a PNG's end holds its checksum, so any change of its pixels shows there."""
-    try:
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            head = file.read(END_BYTES)
-            file.seek(max(0, size - END_BYTES))
-            return hashlib.sha256(f"{size}\0".encode() + head + file.read()).digest()
-    except OSError:
-        return b"missing"
 
 
 def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:

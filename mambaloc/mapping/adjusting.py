@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import bsr_array
 
 from mambaloc.mapping.triangulation import Observations
 from mambaloc.runtime.maps.lens import Lens
@@ -27,7 +28,6 @@ Floats = NDArray[np.floating[Any]]
 _STEPS = 12
 _CONVERGED = 1e-3  # of the cost
 _DAMPING, _MOST_DAMPING = 1e-4, 1e4
-_AT_ONCE = 512  # points that are eliminated together
 _FOCAL, _RADIAL = 0.02, 0.05  # one standard deviation of the prior
 _FIXED = 1e-9
 _LEAST_DEPTH = 1e-3  # of the cameras' spread
@@ -189,27 +189,19 @@ class _Equations:
         trace = np.trace(self.point_normal, axis1=1, axis2=2)
         inverse = np.linalg.inv(self.point_normal + (damping * trace + 1e-9)[:, None, None] * np.eye(3))
         root = np.linalg.cholesky(inverse)
+        half, end = _t(root), 6 * self.cameras
+        # Points in axes in which their damped normal matrix is the identity.
+        blocks = half[self.track] @ _t(self.camera_point), self.frame, np.append(self.first, len(self.track))
+        camera = bsr_array(blocks, shape=(3 * len(root), end))
+        lens, right = (half @ _t(self.lens_point)).reshape(-1, 2), (half @ self.point_right).ravel()
         normal = self.normal + damping * np.diag(np.diag(self.normal))
-        right = self.right.copy()
-        for start in range(0, len(root), _AT_ONCE):
-            mixed = self._mixed(start, root)
-            normal -= mixed @ mixed.T
-            right -= mixed @ (_t(root[start : start + _AT_ONCE]) @ self.point_right[start : start + _AT_ONCE]).ravel()
-        step = -np.linalg.solve(normal, right)
-        cameras, lens = step[:-2].reshape(-1, 6), step[-2:]
-        pull = np.add.reduceat(_t(self.camera_point) @ cameras[self.frame][..., None], self.first)
-        pull += _t(self.lens_point) @ lens[:, None]
-        return cameras, -(inverse @ (self.point_right + pull))[..., 0], lens
-
-    def _mixed(self, start: int, root: Floats) -> Floats:
-        """Cameras and lens by some points, times a root of the points' inverse, (6 N + 2, 3 * points)."""
-        count = min(_AT_ONCE, len(root) - start)
-        rows = slice(*np.searchsorted(self.track, (start, start + count)))
-        mixed = np.zeros((self.cameras, count, 6, 3))
-        np.add.at(mixed, (self.frame[rows], self.track[rows] - start), self.camera_point[rows] @ root[self.track[rows]])
-        lens = self.lens_point[start : start + count] @ root[start : start + count]
-        cameras = mixed.transpose(0, 2, 1, 3).reshape(6 * self.cameras, -1)
-        return np.concatenate((cameras, lens.transpose(1, 0, 2).reshape(2, -1)))
+        normal[:end, :end] -= (camera.T @ camera).toarray()
+        normal[:end, end:] -= camera.T @ lens
+        normal[end:, :end] = normal[:end, end:].T
+        normal[end:, end:] -= lens.T @ lens
+        step = -np.linalg.solve(normal, self.right - np.concatenate((camera.T @ right, lens.T @ right)))
+        points = -root @ (right + camera @ step[:end] + lens @ step[end:]).reshape(-1, 3, 1)
+        return step[:end].reshape(-1, 6), points[..., 0], step[end:]
 
 
 def _t(matrices: Floats) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,15 +16,15 @@ from numpy.typing import NDArray
 
 from mambaloc.console import progress
 from mambaloc.errors import InputError
-from mambaloc.images import Image, as_rgb, read_image
+from mambaloc.images import Image
 from mambaloc.mapping.choosing import bytes_each, most_useful
 from mambaloc.mapping.given_points import described
+from mambaloc.mapping.kept_parts import kept_keypoints, kept_matches, picture_name
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.structure import Structure, recover_structure
-from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps.drift import fit_drift
-from mambaloc.runtime.maps.features import Features, detect_features, quantized
+from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.sparse_map import SparseMap
 
 if TYPE_CHECKING:
@@ -35,9 +36,9 @@ _LEAST_KEYPOINTS = 20
 _LEAST_AGREEING = 0.3  # of matches; a tenth agree with any pose by chance
 
 POINTS = ("triangulated", COLMAP := "colmap")
-"""What :class:`MapSettings` may say of points."""
+"""Values of :attr:`MapSettings.points`."""
 COLMAP_POINTS = "points of COLMAP"
-"""The digest of a map whose points are those of a COLMAP model."""
+"""Name of the digest that a map with the points of a COLMAP model has."""
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -64,7 +65,7 @@ class PosedFrames:
         return len(self.images)
 
     def select(self, rows: Indices) -> PosedFrames:
-        """Some of them."""
+        """The frames of these rows."""
         return PosedFrames(
             [self.images[row] for row in rows],
             self.intrinsics[rows],
@@ -78,10 +79,10 @@ class MapSettings:
     """How a map is built.
 
     Args:
-        key_frames: so many at most.
+        key_frames: how many, at most.
         width: of the pictures in which keypoints are searched, in pixels.
         most_bytes: budget of points and descriptors.
-        least_inliers: matches that a pose needs to be accepted.
+        least_inliers: how many inliers a pose needs to be accepted.
         seed: of the views that triangulation draws.
         points: ``triangulated`` from our own matches; or ``colmap``, as an imported COLMAP model has them, where there
             is one, in a third of the time. Measured on a rendered room (80 key frames at 240 px): where COLMAP
@@ -102,26 +103,23 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
     """Build a map from posed frames.
 
     Args:
-        frames: to choose key frames from.
-        settings: how it is built.
+        frames: candidates for key frames.
+        settings: how the map is built.
         scene: name of the place.
-        threads: decode, search and match with so many; one a core unless given. They do not change the result.
+        threads: to decode, search and match with; one per core unless given. The result does not depend on it.
 
     Raises:
         InputError: where frames are too few, lack texture or parallax, or contradict their poses; or an image is bad.
     """
     if len(frames) < 2:
-        raise InputError(f"{scene}: {len(frames)} frames cannot be triangulated. Give two or more, from apart.")
+        raise InputError(
+            f"{scene}: triangulation needs two frames or more, and it has {len(frames)}. "
+            "Give more, taken from different places."
+        )
     key = frames.select(farthest_first(frames.world_from_cam, settings.key_frames))
     tracks = key.tracks if settings.points == COLMAP else None
     pairs = np.empty((0, 2), np.int64) if tracks else _pairs(scene, key)
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        features = _each(pool, lambda row: _features(key, row, settings.width), range(len(key)), "keypoints")
-        if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
-            raise InputError(
-                f"{scene}: its frames have {keypoints:.0f} keypoints each. Film texture, or enlarge width."
-            )
-        matches = _each(pool, lambda pair: match(features[pair[0]], features[pair[1]]), list(pairs), "matches")
+    features, matches = _searched(scene, key, pairs, settings.width, threads or os.cpu_count())
     if tracks:
         structure = described(tracks, features, key.world_from_cam)
     else:
@@ -150,12 +148,12 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
 
 
 def describe_points(sparse_map: SparseMap) -> str:
-    """How many points a map has, and whose they are."""
+    """How many points a map has, and where they come from, in one line."""
     return f"points {'from COLMAP' if COLMAP_POINTS in sparse_map.digests else 'triangulated'}: {len(sparse_map)}"
 
 
 def _digests(frames: PosedFrames, tracks: Tracks | None) -> dict[str, str]:
-    """Of the poses, and of the points of a COLMAP model where they are used."""
+    """Digests of the poses, and of the points of a COLMAP model where they are used."""
     digests = {"poses": hashlib.sha256(frames.world_from_cam.tobytes() + frames.intrinsics.tobytes()).hexdigest()}
     if tracks:
         digests[COLMAP_POINTS] = hashlib.sha256(tracks.points_m.tobytes() + tracks.rays.tobytes()).hexdigest()
@@ -166,21 +164,39 @@ def _pairs(scene: str, key: PosedFrames) -> Indices:
     pairs = pairs_by_pose(key.world_from_cam)
     if not len(pairs):
         raise InputError(
-            f"{scene}: no two of {len(key)} key frames look the same way from apart. Film while walking, not turning."
+            f"{scene}: no two of {len(key)} key frames look in a similar direction from different places. "
+            "Film while walking, not turning."
         )
     return pairs
 
 
+def _searched(
+    scene: str, key: PosedFrames, pairs: Indices, width: int, threads: int | None
+) -> tuple[list[Features], list[Indices]]:
+    """Keypoints of key frames, and the matches of each pair; pairs are ordered by their first frame."""
+    names = [picture_name(image, width) for image in key.images]
+    others = np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, len(key))))
+
+    def searched(row: int) -> Features:
+        return kept_keypoints(key.images[row], width, names[row]).described(key.intrinsics[row])
+
+    def matched(row: int) -> list[Indices]:
+        rows = [row, *others[row]]
+        return kept_matches([features[each] for each in rows], [names[each] for each in rows])
+
+    with ThreadPoolExecutor(threads) as pool:
+        features = _each(pool, searched, range(len(key)), "keypoints")
+        if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
+            raise InputError(
+                f"{scene}: its frames have {keypoints:.0f} keypoints each. "
+                "Film surfaces with more texture, or use a larger width."
+            )
+        matches = _each(pool, matched, range(len(key)), "matches")
+    return features, list(itertools.chain.from_iterable(matches))
+
+
 def _each(pool: ThreadPoolExecutor, work: Callable[[S], T], items: Sequence[S], name: str) -> list[T]:
     return list(progress(pool.map(work, items), name, len(items)))
-
-
-def _features(frames: PosedFrames, row: int, width: int) -> Features:
-    image = frames.images[row]
-    rgb = read_image(image) if isinstance(image, Path) else as_rgb(image)
-    if width > rgb.shape[1]:
-        raise InputError(f"width {width}: the pictures are {rgb.shape[1]} pixels wide. Give at most that.")
-    return detect_features(rgb, frames.intrinsics[row], width / rgb.shape[1])
 
 
 def _check_enough(scene: str, structure: Structure, least: int) -> None:

@@ -86,7 +86,7 @@ class Outlook:
 
 
 def _information(towards: Floats, depth_m: Floats) -> Floats:
-    """What a bearing with an error of one radian tells of the position and of a turn, ``J^T J``, (P, 36)."""
+    """Information ``J^T J`` about position and rotation in a bearing with an error of one radian, (P, 36)."""
     across = np.eye(3) - towards[:, :, None] * towards[:, None]
     turned = np.cross(towards[:, None], np.eye(3)[None])  # row k is towards x e_k, what a turn about e_k does
     jacobian = np.concatenate((-across / depth_m[:, None, None], turned.transpose(0, 2, 1)), axis=2)

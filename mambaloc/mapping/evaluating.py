@@ -61,7 +61,7 @@ class MapErrors:
     cpu_s: Floats
 
     def summary(self) -> dict[str, float]:
-        """As :func:`~mambaloc.metrics.summarise_errors`, and what becomes of accepted poses.
+        """As :func:`~mambaloc.metrics.summarise_errors`, and how many poses are accepted and wrong.
 
         ``accepted_and_wrong`` and ``covariance_90`` are shares of accepted poses: of those more than 0.2 m or 5 degrees
         off, and of those whose covariance covers the truth.
@@ -78,7 +78,7 @@ class MapErrors:
         }
 
     def describe(self) -> str:
-        """In one line."""
+        """Median errors and shares, in one line."""
         summary = self.summary()
         return (
             f"median {summary['position_error_m']:.3f} m / {summary['rotation_error_deg']:.2f} deg, "
@@ -158,7 +158,7 @@ class Making:
     """How a map was made.
 
     Args:
-        frames: to choose key frames from.
+        frames: how many there were to choose key frames from.
         settings: of building, or of adding to it.
         core_seconds: CPU time that it took.
         cameras: of these frames. A lens is only fitted where there is one; of several, intrinsics are taken as given.
@@ -233,18 +233,30 @@ def measure_saved(path: Path, recipe: MapRecipe, test: PosedFrames, making: Maki
     sparse_map = SparseMap.load(path)
     started = time.perf_counter()
     errors = measure(sparse_map, test, recipe.ransac_seeds)
-    metrics = errors.summary()
-    result = {
-        "metrics": metrics,
+    result = _result(path, sparse_map, errors, recipe, making, time.perf_counter() - started)
+    # JSON has no infinity, which the worst error is where a frame has no pose.
+    finite = {name: value if math.isfinite(value) else None for name, value in result["metrics"].items()}
+    with writing(path.parent), whole_file(path.parent / "metrics.json") as partial:
+        partial.write_text(json.dumps({**result, "metrics": finite}, indent=2) + "\n", encoding="utf-8")
+    return MeasuredMap(sparse_map, test, errors, result)
+
+
+def _result(
+    path: Path, sparse_map: SparseMap, errors: MapErrors, recipe: MapRecipe, making: Making, seconds: float
+) -> dict[str, Any]:
+    """What ``metrics.json`` says of a map and its errors, which took ``seconds`` to measure."""
+    frames = len(errors.position_m) // len(recipe.ransac_seeds)
+    return {
+        "metrics": errors.summary(),
         "label": recipe.name,
         "split": "test",
-        "count": len(test),
+        "count": frames,
         "ransac_seeds": list(recipe.ransac_seeds),
         "data": {
             "dataset": recipe.dataset,
             "scene": recipe.scene,
             "train_frames": making.frames,
-            "test_frames": len(test),
+            "test_frames": frames,
         },
         "map": {
             "settings": making.settings,
@@ -263,12 +275,7 @@ def measure_saved(path: Path, recipe: MapRecipe, test: PosedFrames, making: Maki
             "versions": provenance.versions(),
             "device": provenance.device_name(),
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "seconds": round(time.perf_counter() - started, 3),
+            "seconds": round(seconds, 3),
             "seconds_are": "core_seconds and query_cpu_ms are CPU time of the process",
         },
     }
-    # JSON has no infinity, which the worst error is where a frame has no pose.
-    finite = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
-    with writing(path.parent), whole_file(path.parent / "metrics.json") as partial:
-        partial.write_text(json.dumps({**result, "metrics": finite}, indent=2) + "\n", encoding="utf-8")
-    return MeasuredMap(sparse_map, test, errors, result)

@@ -1,4 +1,4 @@
-"""Grow a sparse map by new frames, and take them out again; what stands in the map does not move."""
+"""Add frames to a sparse map and remove them again; the points and key frames that it has do not move."""
 
 from __future__ import annotations
 
@@ -84,8 +84,8 @@ def add_frames(
     Args:
         sparse_map: the map.
         frames: what to add.
-        session: a name by which :func:`remove_session` removes all of it.
-        most: key frames to add; they are spread over the poses found.
+        session: name of the addition, for :func:`remove_session`.
+        most: how many key frames to add, at most; they are spread over the poses found.
         most_bytes: budget of the points and descriptors that are added.
 
     Raises:
@@ -93,9 +93,9 @@ def add_frames(
             where all poses contradict those given.
     """
     if session in sparse_map.sessions:
-        raise InputError(f"{session}: was added before. Remove that first, or add these under another --name.")
+        raise InputError(f"{session}: is in the map already. Remove it first, or choose another --name.")
     if session in sparse_map.digests:
-        raise InputError(f"{session}: is a name that the map uses itself. Give another --name.")
+        raise InputError(f"{session}: is a name that the map itself uses. Choose another --name.")
     matched = functools.cache(lambda first, second: match(frames[first].features, frames[second].features))
     poses: dict[int, CameraPose] = {}
     grown, rounds, contradict = sparse_map, 0, 0
@@ -122,8 +122,8 @@ def remove_session(sparse_map: SparseMap, session: str) -> SparseMap:
         InputError: where the map has no such session.
     """
     if session not in sparse_map.sessions:
-        added = ", ".join(sparse_map.sessions) or "nothing"
-        raise InputError(f"{session}: was never added to the map of {sparse_map.scene}. What was added: {added}.")
+        added = ", ".join(sparse_map.sessions) or "none"
+        raise InputError(f"{session}: is not in the map of {sparse_map.scene}. Choose one of its sessions: {added}.")
     names = list(sparse_map.sessions)
     later = sum(sparse_map.sessions[name] for name in names[names.index(session) + 1 :])
     end = len(sparse_map.key_poses) - later

@@ -15,7 +15,7 @@ def farthest_first(world_from_cam: ArrayLike, count: int) -> NDArray[np.int64]:
 
     Args:
         world_from_cam: (N, 4, 4).
-        count: so many at most.
+        count: how many, at most.
 
     Returns:
         Rows in ascending order, (min(count, N),).

@@ -43,7 +43,7 @@ def read_new_frames(
     """
     if source.suffix in (".yaml", ".yml") or (source.is_dir() and is_captured(source)):
         if intrinsics is not None:
-            raise InputError(f"{source}: says what its cameras are. Leave out --intrinsics.")
+            raise InputError(f"{source}: has intrinsics of its own. Leave out --intrinsics.")
         return list(_posed(source, localiser))
     frames = list(_unposed(source, localiser, intrinsics))
     if intrinsics is None:

@@ -17,8 +17,8 @@ class MapRecipe:
     Args:
         scene: name of a dataset's scene, or the path of an imported one.
         dataset: as :class:`~mambaloc.data.PoseDataModule` takes it.
-        root: likewise.
-        label: how results call these frames; the scene's name unless given.
+        root: as :class:`~mambaloc.data.PoseDataModule` takes it.
+        label: name of the map in results; the scene's name unless given.
         settings: how the map is built.
         ransac_seeds: each test frame is localised once with each.
     """
@@ -32,13 +32,13 @@ class MapRecipe:
 
     @property
     def name(self) -> str:
-        """How results call the scene."""
+        """Name of the map in results."""
         return self.label or Path(self.scene).name
 
 
 _TYPES = {"scene": str, "dataset": str, "root": str, "label": str}
 LEAST = {"key_frames": 2, "width": 32, "most_bytes": 1000, "least_inliers": 4, "seed": 0}
-"""The least that each setting of a map may be."""
+"""Smallest allowed value of each setting."""
 
 
 def read_recipe(path: Path) -> MapRecipe:
@@ -52,7 +52,7 @@ def read_recipe(path: Path) -> MapRecipe:
         raise InputError(f"{path}: does not name a scene. Add 'scene: NAME'.")
     for key, value in data.items():
         if key in _TYPES:
-            fits, what = isinstance(value, str), "a text"
+            fits, what = isinstance(value, str), "text"
         elif key in LEAST:
             fits, what = _is_int(value, LEAST[key]), f"a whole number of {LEAST[key]} or more"
         elif key == "points":
@@ -71,7 +71,7 @@ def read_recipe(path: Path) -> MapRecipe:
 
 
 def recipe_of(source: Path) -> MapRecipe:
-    """The recipe that a file holds, or that an imported scene's folder stands for; errors are :func:`read_recipe`'s."""
+    """The recipe in a file, or the default one of an imported scene's folder; errors are :func:`read_recipe`'s."""
     return MapRecipe(str(source)) if source.is_dir() else read_recipe(source)
 
 

@@ -135,7 +135,7 @@ def _frames(walk, **changes):
 
 
 def test_too_few_frames_are_refused(walk):
-    with pytest.raises(InputError, match=r"1 frames cannot be triangulated"):
+    with pytest.raises(InputError, match=r"needs two frames or more, and it has 1"):
         build_map(walk.frames.select(np.array([0])), SETTINGS, "room")
 
 
@@ -148,7 +148,7 @@ def test_frames_that_only_turn_are_refused(walk):
 
 def test_frames_without_texture_are_refused(walk):
     blank = [np.full((120, 160, 3), 90, np.uint8)] * 10
-    with pytest.raises(InputError, match=r"0 keypoints each\. Film texture"):
+    with pytest.raises(InputError, match=r"0 keypoints each\. Film surfaces with more texture"):
         build_map(_frames(walk, images=blank), SETTINGS, "room")
 
 

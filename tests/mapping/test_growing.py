@@ -89,7 +89,7 @@ def test_sessions_are_removed_in_any_order(growths, part, walk):
     )
     assert left.is_seen.any(axis=1).all()
     _assert_same(remove_session(left, "third"), part)
-    with pytest.raises(InputError, match=r"second: was never added to the map of room\. What was added: third\."):
+    with pytest.raises(InputError, match=r"second: is not in the map of room\. Choose one of its sessions: third\."):
         remove_session(left, "second")
 
 
@@ -126,9 +126,9 @@ def test_what_is_added_has_a_budget(part, walk):
 
 def test_the_same_name_is_not_added_twice(growths, walk):
     grown = growths[False].sparse_map
-    with pytest.raises(InputError, match=r"second: was added before\. .* --name"):
+    with pytest.raises(InputError, match=r"second: is in the map already\. .* --name"):
         add_frames(grown, _new(grown, walk, ROWS[:2], False), "second", 20)
-    with pytest.raises(InputError, match=r"^poses: is a name that the map uses itself\. Give another --name\."):
+    with pytest.raises(InputError, match=r"^poses: is a name that the map itself uses\. Choose another --name\."):
         add_frames(grown, _new(grown, walk, ROWS[:2], False), "poses", 20)
 
 
@@ -214,7 +214,7 @@ def test_pictures_of_another_camera_are_refused_or_named(part, walk, tmp_path):
 
 def test_pictures_of_another_shape_need_their_camera(part, tmp_path):
     cv2.imwrite(str(tmp_path / "tall.png"), np.zeros((160, 120, 3), np.uint8))
-    with pytest.raises(InputError, match=r"picture of 120x160: has another shape .* Give its intrinsics"):
+    with pytest.raises(InputError, match=r"picture of 120x160: its shape differs .* Give its intrinsics"):
         read_new_frames(tmp_path, MapLocaliser(part))
 
 

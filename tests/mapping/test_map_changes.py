@@ -79,7 +79,10 @@ def test_pictures_are_added_measured_and_removed_again(folder, pictures, den, tm
     ("argv", "message"),
     [
         (["--add", "{pictures}"], r"map\.safetensors: is not overwritten unasked\. Give --out FOLDER, which may be"),
-        (["--remove", "attic", "--out", "{out}"], r"attic: was never added to the map of room\. What was added: noth"),
+        (
+            ["--remove", "attic", "--out", "{out}"],
+            r"attic: is not in the map of room\. Choose one of its sessions: none",
+        ),
         (["--add", "{empty}", "--out", "{out}"], r"holds no picture"),
         (["--add", "{out}/no.mp4", "--out", "{out}"], r"no such file"),
         (["--remove", "attic", "--out", "{out}", "--name", "attic"], r"--name: is of what --add adds\. Leave it out"),

@@ -59,7 +59,7 @@ def test_the_recipe_of_the_blocks_is_read():
         ("scene: a\nwidth: wide", "width is 'wide'. Give a whole number of 32 or more"),
         ("scene: a\nkey_frames: true", "key_frames is 'True'"),
         ("scene: a\nkey_frames: 1", "key_frames is '1'. Give a whole number of 2 or more"),
-        ("scene: a\nroot: 3", "root is '3'. Give a text"),
+        ("scene: a\nroot: 3", "root is '3'. Give text"),
         ("scene: a\nransac_seeds: []", "ransac_seeds is '[]'. Give a list"),
         ("scene: a\nransac_seeds: 0", "ransac_seeds is '0'. Give a list"),
         ("scene: [", "is no YAML"),

@@ -149,7 +149,10 @@ def test_unknown_cameras_are_a_warning(capture, tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "settings", "says"),
-    [({"keep_count": 1}, {}, "1 frames cannot be triangulated"), ({}, {"width": 320}, "pictures are 160 pixels wide")],
+    [
+        ({"keep_count": 1}, {}, "needs two frames or more, and it has 1"),
+        ({}, {"width": 320}, "pictures are 160 pixels wide"),
+    ],
 )
 def test_frames_that_give_no_map_are_a_warning_and_an_older_map_goes(options, settings, says, den, tmp_path):
     (tmp_path / "map").mkdir()

@@ -15,14 +15,13 @@ import numpy as np
 import torch
 from filelock import FileLock
 
-from mambaloc.data.cache import fingerprint
 from mambaloc.data.frame_dataset import LoadedSplit
 from mambaloc.data.points.depth import INTRINSICS_FILE, depth_path
 from mambaloc.data.views.depth import VIEW_DEPTHS, FoundDepth, ViewDepth, depth_of_frames, poses_of
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.files import whole_folder
 from mambaloc.synthesis import PosedDepth, Quality, Views, held_out_quality, make_views
-from mambaloc.user_cache import default_cache_dir
+from mambaloc.user_cache import default_cache_dir, fingerprint
 
 _VERSION = 1
 _REMEDY = "set MAMBALOC_CACHE elsewhere"

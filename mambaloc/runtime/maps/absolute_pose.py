@@ -96,7 +96,7 @@ def refine_pose(start: CameraPose, points_m: Floats, rays: Floats, near: float) 
 
 
 def pose_covariance(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> Floats:
-    """How sure a pose of :func:`refine_pose` is; points, rays and ``near`` are those that it was refined with.
+    """Covariance of a pose of :func:`refine_pose`; points, rays and ``near`` are those that it was refined with.
 
     Returns:
         (6, 6), of the position in metres, then of the rotation in radians about the fixed axes of the world

@@ -1,4 +1,4 @@
-"""How probable it is that a pose found in a map is right: what its distinctive matches say.
+"""How probable it is that a pose found in a map is right, estimated from its distinctive matches.
 
 A search around a wrong pose finds matches, too: one of the few points near a keypoint is the most similar, and the pose
 follows those that agree by chance. Hardly any of these is distinctive: the most similar of all points in view.
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 RULE = 2
 """Version of what follows."""
 LEAST_PROBABILITY = 0.95
-"""A pose that is as probable is accepted: of such poses of frames held out of training, at most 0.5 % were wrong."""
+"""The least probability of an accepted pose: of such poses of held-out training frames at most 0.5 % were wrong."""
 CALIBRATION = {"frames": 272, "pictures": 3941, "accepted": 0.666, "accepted_and_wrong": 0.0034}
-"""What that rests on: frames held out of training, of a real room and a rendered one, each in two maps; pictures of
+"""How that was measured: frames held out of training, of a real room and a rendered one, each in two maps; pictures of
 them, disturbed, that gave a pose; the share that is accepted, with 20 inliers, by coefficients that were fitted to
 other sequences; and of these the wrong ones' (95 %: 0.18 to 0.65 %)."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -58,31 +59,61 @@ class Features:
         return normalized([(-0.5, -0.5), (self.size[0] - 0.5, self.size[1] - 0.5)], self.intrinsics)
 
 
-def detect_features(image: Image, intrinsics: ArrayLike, scale: float) -> Features:
+class Keypoints(NamedTuple):
+    """What SIFT finds in a picture once it is made smaller, whatever its camera.
+
+    Shape:
+        ``pixels`` (N, 2) float32 of the smaller picture; ``histograms`` (N, 128) uint8; ``size`` and ``full_size``
+        (2,), width and height of the smaller picture and of the picture itself.
+    """
+
+    pixels: NDArray[np.float32]
+    histograms: NDArray[np.uint8]
+    size: NDArray[np.int64]
+    full_size: NDArray[np.int64]
+
+    def described(self, intrinsics: ArrayLike) -> Features:
+        """With RootSIFT descriptors, and the camera of the picture itself, (3, 3).
+
+        Raises:
+            InputError: where the intrinsics do not fit the picture.
+        """
+        (width, height), size = self.full_size.tolist(), (int(self.size[0]), int(self.size[1]))
+        check_intrinsics(intrinsics, (width, height))
+        floats = self.histograms.astype(np.float32)
+        root = np.sqrt(floats / np.maximum(floats.sum(axis=1, keepdims=True), 1))
+        small = rescaled_intrinsics(intrinsics, (width, height), size)
+        return Features(self.pixels.astype(np.float64), root, small, size)
+
+
+def find_keypoints(image: Image, scale: float) -> Keypoints:
     """Find the keypoints of a picture once it is made smaller.
 
     Args:
         image: RGB (H, W, 3), ``uint8``, without distortion.
-        intrinsics: (3, 3) pinhole matrix of it.
         scale: width of the smaller picture over that of the picture; 1 at most counts.
-
-    Raises:
-        InputError: where the intrinsics do not fit the picture.
     """
     height, width = image.shape[:2]
-    check_intrinsics(intrinsics, (width, height))
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     size = (max(1, round(width * min(scale, 1))), max(1, round(height * min(scale, 1))))
     if size != (width, height):
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     # The precise upscale puts keypoints where they are; otherwise each is 0.25 px to the lower right.
     sift = cv2.SIFT.create(_MOST_KEYPOINTS, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(grey, None)
-    small = rescaled_intrinsics(intrinsics, (width, height), size)
-    if not keypoints:
-        return Features(np.empty((0, 2)), np.empty((0, 128), np.float32), small, size)
-    root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1))
-    return Features(np.array([point.pt for point in keypoints]), root.astype(np.float32), small, size)
+    keypoints, histograms = sift.detectAndCompute(grey, None)
+    pixels = np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2)
+    whole = np.zeros((0, 128), np.uint8) if histograms is None else histograms.astype(np.uint8)  # they are whole
+    return Keypoints(pixels, whole, np.array(size), np.array((width, height)))
+
+
+def detect_features(image: Image, intrinsics: ArrayLike, scale: float) -> Features:
+    """Find and describe the keypoints of a picture; arguments are those of :func:`find_keypoints`.
+
+    Raises:
+        InputError: where the intrinsics, (3, 3), do not fit the picture.
+    """
+    check_intrinsics(intrinsics, (image.shape[1], image.shape[0]))
+    return find_keypoints(image, scale).described(intrinsics)
 
 
 def rescaled_intrinsics(intrinsics: ArrayLike, size: tuple[int, int], new_size: tuple[int, int]) -> Floats:

@@ -36,7 +36,7 @@ _GUIDED_RATIO = 0.95
 _GUIDED_FARTHEST = 0.9  # of unit descriptors
 _NEAREST = 8  # key frames whose points are searched again
 _WINDOWS = (6.0, 2.0)  # radii of the guided rounds, in times of what is near
-_PRIOR_WINDOW = 12.0  # likewise, around a prior: 54 px at a width of 160
+_PRIOR_WINDOW = 12.0  # radius around a prior: 54 px at a width of 160
 _LEAST_SHARE = 0.1
 _SHARED = 1.25  # of variances: neighbouring matches share errors; chosen on frames held out of rendered rooms
 
@@ -51,10 +51,10 @@ class MapLocalisation:
 
     Args:
         position_m: in the map's frame.
-        quaternion: likewise.
+        quaternion: of the camera's rotation in the map's frame.
         inliers: matches that agree with the pose.
-        is_accepted: whether to believe it: it is as probable as
-            :data:`~mambaloc.runtime.maps.acceptance.LEAST_PROBABILITY`, and has as many inliers as the map asks for.
+        is_accepted: whether its probability reaches :data:`~mambaloc.runtime.maps.acceptance.LEAST_PROBABILITY` and it
+            has as many inliers as the map requires.
         covariance: of the position in metres, then of the rotation in radians about the fixed axes of the world: the
             order and frame of ROS's PoseWithCovariance. It says how well the matches fix the pose; errors that the
             map's own poses share are not in it.
@@ -237,8 +237,8 @@ class MapLocaliser:
         height, width = image.shape[:2]
         if abs(width * self.map.size[1] - height * self.map.size[0]) > max(self.map.size):
             raise InputError(
-                f"picture of {width}x{height}: has another shape than the map's of {self.map.size[0]}x"
-                f"{self.map.size[1]}, so its camera is unknown. Give its intrinsics."
+                f"picture of {width}x{height}: its shape differs from the map's pictures of "
+                f"{self.map.size[0]}x{self.map.size[1]}, so its camera is unknown. Give its intrinsics."
             )
         return rescaled_intrinsics(self.map.intrinsics, self.map.size, (width, height))
 

@@ -41,9 +41,9 @@ class SparseMap:
         ``numpy.packbits`` writes them; ``key_poses`` (K, 4, 4) and ``intrinsics`` (3, 3) float64.
 
     Args:
-        points_m: what a camera sees.
-        descriptors: how they look.
-        views: which key frames see each.
+        points_m: positions of the points.
+        descriptors: one a point.
+        views: which key frames see each point.
         key_poses: ``world_from_cam`` of the key frames, adjusted to the pictures as the points are.
         size: (width, height) of the pictures in which keypoints were searched.
         intrinsics: of their camera, of the first key frame where there are several.
@@ -147,7 +147,7 @@ class SparseMap:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"{path}: is damaged or not a map ({reason}). Build the map again.") from None
         raise InputError(
-            f"{path}: is of version {about['version']}, and this program reads up to {VERSION}. Update the program."
+            f"{path}: has version {about['version']}, and this program reads versions up to {VERSION}. Update mambaloc."
         )
 
     @classmethod

@@ -97,7 +97,7 @@ def test_what_is_no_map_is_refused_in_a_line(change, sparse_map, tmp_path):
     changes = dict(CHANGES[change])
     told = changes.pop("about", {})
     _write(path, arrays | changes, told if isinstance(told, str) else about | told)
-    with pytest.raises(InputError, match=r"Update the program" if change == "a newer version" else r"Build the map"):
+    with pytest.raises(InputError, match=r"Update mambaloc" if change == "a newer version" else r"Build the map"):
         SparseMap.load(path)
 
 
