@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from mambaloc.errors import InputError
+from mambaloc.nn.winograd import use_winograd
 
 
 class ImageBackbone(nn.Module):
@@ -45,6 +46,7 @@ class ImageBackbone(nn.Module):
     ) -> None:
         super().__init__()
         self.name, self.body = name, body
+        use_winograd(body)
         self._fixed: list[nn.Module] = []
         if weights is not None:
             self._load(Path(weights))
