@@ -2,7 +2,8 @@
 
 The loop decodes every frame every epoch (PIL, torchvision transforms, loader workers), computes in float32, eagerly,
 and reads each loss with ``.item()``. Others do less: RAP decodes once into memory, computes in float16 on a GPU,
-compiles, and keeps batch-norm statistics. The network does what ours does, in its published form: see :class:`Published`.
+compiles, and keeps batch-norm statistics. The network does what ours does, in its published form: see
+:class:`Published`.
 """
 
 from __future__ import annotations

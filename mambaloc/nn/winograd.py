@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 _TILE = 4  # output pixels along an axis of a tile
 _WINDOW = _TILE + 2  # input pixels that they read
 _WORKING_BYTES = 5 * 2**20  # of transformed tiles at a time: they stay in the cache
-_INPUT = [
+_INPUT: list[list[float]] = [
     [4, 0, -5, 0, 1, 0],
     [0, -4, -4, 1, 1, 0],
     [0, 4, -4, -1, 1, 0],
@@ -20,7 +20,7 @@ _INPUT = [
     [0, 2, -1, -2, 1, 0],
     [0, 4, 0, -5, 0, 1],
 ]
-_FILTER = [
+_FILTER: list[list[float]] = [
     [1 / 4, 0, 0],
     [-1 / 6, -1 / 6, -1 / 6],
     [-1 / 6, 1 / 6, -1 / 6],
@@ -28,7 +28,7 @@ _FILTER = [
     [1 / 24, -1 / 12, 1 / 6],
     [0, 0, 1],
 ]
-_OUTPUT = [[1, 1, 1, 1, 1, 0], [0, 1, -1, 2, -2, 0], [0, 1, 1, 4, 4, 0], [0, 1, -1, 8, -8, 1]]
+_OUTPUT: list[list[float]] = [[1, 1, 1, 1, 1, 0], [0, 1, -1, 2, -2, 0], [0, 1, 1, 4, 4, 0], [0, 1, -1, 8, -8, 1]]
 
 
 class WinogradConv2d(nn.Conv2d):
@@ -81,7 +81,7 @@ class _Winograd(torch.autograd.Function):
         image_BCHW, weight_KC33 = ctx.saved_tensors
         image_BHWC, grad_BHWK = image_BCHW.permute(0, 2, 3, 1), grad_BKHW.permute(0, 2, 3, 1)
         filter_PKC = _transformed(weight_KC33)
-        (out_channels, channels), of_image, of_weight = filter_PKC.shape[1:], *ctx.needs_input_grad
+        (out_channels, channels), (of_image, of_weight) = filter_PKC.shape[1:], ctx.needs_input_grad
         inward, outward = _matrix(_INPUT, image_BCHW), _matrix(_OUTPUT, image_BCHW)
         grad_filter_PKC = torch.zeros_like(filter_PKC)
         grad_image_BHWC = torch.empty_like(image_BHWC, memory_format=torch.contiguous_format)
