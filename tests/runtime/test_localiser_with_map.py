@@ -174,7 +174,7 @@ def damage(path, how):
 
 
 @pytest.mark.parametrize(
-    ("how", "message"), [("newer", "Update the program"), ("cut", "is damaged"), ("flipped", "checksum differs")]
+    ("how", "message"), [("newer", "Update mambaloc"), ("cut", "is damaged"), ("flipped", "checksum differs")]
 )
 def test_a_bad_map_in_a_bundle_leaves_the_network(how, message, bundle, frame):
     damage(bundle / "map.safetensors", how)
