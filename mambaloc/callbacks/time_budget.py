@@ -30,7 +30,7 @@ class TimeBudget(L.Callback):
         InputError: for a budget that leaves no time to train.
     """
 
-    def __init__(self, minutes: float | None = None, reserve_s: float = 15.0) -> None:
+    def __init__(self, minutes: float | None = None, reserve_s: float = 30.0) -> None:
         if minutes is not None and not reserve_s < 60 * minutes < math.inf:
             raise InputError(
                 f"time_budget.minutes {minutes:g}: must be more than the {reserve_s:g} s of time_budget.reserve_s"

@@ -67,7 +67,7 @@ def test_a_budget_that_is_used_up_before_the_first_step(clock):
     budget, clock.s = TimeBudget(minutes=1), 61.0
     with pytest.raises(InputError, match=r"time_budget\.minutes 1: 61 s went by before the first step\. Give more"):
         budget.on_train_start(SimpleNamespace(fast_dev_run=0), SimpleNamespace())
-    with pytest.raises(InputError, match=r"time_budget\.minutes 0.2: must be more than the 15 s of"):
+    with pytest.raises(InputError, match=r"time_budget\.minutes 0.2: must be more than the 30 s of"):
         TimeBudget(minutes=0.2)
 
 
