@@ -27,17 +27,24 @@ def default_cache_dir() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mambaloc"
 
 
-def made_once(name: str, make: Callable[[Path], object]) -> Path:
+def made_once(
+    name: str,
+    make: Callable[[Path], object],
+    cache_dir: Path | None = None,
+    remedy: str = "set MAMBALOC_CACHE to a folder that can be written",
+) -> Path:
     """A folder of the user's cache: made by who comes first, while others wait, and found again by all.
 
     Args:
         name: of the folder, below the cache.
         make: fills an empty folder, which gets its name once this ends; an error leaves nothing.
+        cache_dir: the cache; the user's own unless given.
+        remedy: what the user may do where it cannot be written.
 
     Raises:
         InputError: where it cannot be written.
     """
-    folder, remedy = default_cache_dir() / name, "set MAMBALOC_CACHE to a folder that can be written"
+    folder = (cache_dir or default_cache_dir()) / name
     if folder.is_dir():
         return folder
     try:

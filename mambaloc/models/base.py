@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_args
@@ -109,6 +110,10 @@ class LitPoseRegressor(L.LightningModule):
             raise InputError(f"model.schedule {schedule!r}: choose one of {', '.join(get_args(Schedule))}")
         if compile_mode not in (None, *get_args(CompileMode)):
             raise InputError(f"model.compile_mode {compile_mode!r}: choose one of {', '.join(get_args(CompileMode))}")
+        if not 0 <= feature_cache_gib < math.inf:
+            raise InputError(
+                f"model.feature_cache_gib {feature_cache_gib:g}: must be 0 or more, and finite. 0 keeps nothing."
+            )
         if feature_cache_gib and compile_mode:
             raise InputError("model.feature_cache_gib: its steps do not run compiled. Set compile_mode to null.")
         self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode

@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mambaloc.errors import InputError
-from mambaloc.files import claim_space, whole_folder
+from mambaloc.files import claim_space
 from mambaloc.nn import SplitBackbone
 from mambaloc.types import PoseBatch
-from mambaloc.user_cache import default_cache_dir
+from mambaloc.user_cache import made_once
 
 _REMEDY = "make room, set MAMBALOC_CACHE elsewhere, or set model.feature_cache_gib to 0"
 
@@ -57,18 +56,12 @@ class FeatureCache:
         self._sizes = [math.prod(shape) for shape in self.shapes]
         room = min(rows * draws, most_bytes // (2 * sum(self._sizes)))
         name = hashlib.sha256(f"{key} {self.shapes} {rows} {room}".encode()).hexdigest()[:32]
-        folder = (cache_dir or default_cache_dir()) / "features" / name
-        try:
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            with FileLock(folder.with_name(f"{name}.lock")):
-                if not folder.is_dir():
-                    with whole_folder(folder, _REMEDY) as partial:
-                        _make_file(partial / "features.npy", np.float16, (room, sum(self._sizes)))
-                        _make_file(partial / "is_kept.npy", np.bool_, (room,))
-        except OSError as error:
-            raise InputError(
-                f"{folder.parent}: cannot be written ({error.strerror}). {_REMEDY.capitalize()}."
-            ) from None
+
+        def make(empty: Path) -> None:
+            _make_file(empty / "features.npy", np.float16, (room, sum(self._sizes)))
+            _make_file(empty / "is_kept.npy", np.bool_, (room,))
+
+        folder = made_once(f"features/{name}", make, cache_dir, _REMEDY)
         self.features, self.is_kept = (
             np.load(folder / f"{file}.npy", mmap_mode="r+") for file in ("features", "is_kept")
         )
@@ -84,7 +77,7 @@ class FeatureCache:
             most_bytes: of the file.
 
         Raises:
-            InputError: where images are augmented anew each epoch.
+            InputError: where images are augmented in a new way each epoch.
         """
         draws = data.hparams["augmentation_draws"]
         if draws is None:

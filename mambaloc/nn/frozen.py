@@ -19,8 +19,8 @@ _TOLERANCE = 1e-3  # of the features' largest value; the two parts run the same 
 class SplitBackbone:
     """Runs the frozen layer groups of a backbone alone, and what comes after them alone; both share its modules.
 
-    It is no module, so that no weight is listed twice. Each part is a shallow copy of the body in which the modules of
-    the other part pass their input on.
+    It is not an ``nn.Module``: no weight is listed twice. Each part is a shallow copy of the body, in which identities
+    replace the modules of the other part.
 
     Args:
         backbone: some of whose first layer groups are frozen.

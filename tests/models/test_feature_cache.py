@@ -79,3 +79,9 @@ def test_a_folder_that_cannot_be_written(tmp_path):
 def test_compiled_steps_keep_no_features():
     with pytest.raises(InputError, match=r"model\.feature_cache_gib: its steps do not run compiled"):
         create_model("mambaloc", compile_mode="default", feature_cache_gib=1.0)
+
+
+@pytest.mark.parametrize("gib", [-1.0, float("nan"), float("inf")])
+def test_a_size_out_of_range(gib):
+    with pytest.raises(InputError, match=rf"model\.feature_cache_gib {gib:g}: must be 0 or more"):
+        create_model("mambaloc", feature_cache_gib=gib)
