@@ -5,6 +5,7 @@ Training and the torch-free runtime both use these, so that an image looks the s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -100,9 +101,14 @@ def resized(image: Image, short_side: int) -> Image:
     return cv2.resize(image, (width, height), interpolation=how)  # type: ignore[return-value]
 
 
+def center_corner(size: Sequence[int], crop: tuple[int, int]) -> tuple[int, int]:
+    """(row, column) of the top-left pixel of the middle crop, both sizes (height, width)."""
+    return (size[0] - crop[0]) // 2, (size[1] - crop[1]) // 2
+
+
 def center_cropped(image: Image, crop: tuple[int, int]) -> Image:
     """Take the middle (height, width) of an image, black where the image is smaller."""
-    top, left = (image.shape[0] - crop[0]) // 2, (image.shape[1] - crop[1]) // 2
+    top, left = center_corner(image.shape[:2], crop)
     inside = image[max(top, 0) : top + crop[0], max(left, 0) : left + crop[1]]
     if inside.shape[:2] == crop:
         return inside

@@ -12,7 +12,6 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mambaloc.errors import InputError
@@ -25,7 +24,7 @@ from mambaloc.geometry import (
     rotation_homography,
     warped,
 )
-from mambaloc.images import LUMA
+from mambaloc.images import LUMA, center_corner
 from mambaloc.types import PoseBatch
 
 _MOST_DEG = 45.0
@@ -125,7 +124,7 @@ class RandomRotation:
         spread = 2 * uniform - 1
         # A log-quaternion is half a rotation vector.
         cam_from_turned = quaternion_from_log(spread[:, :3] * (math.radians(self.rotation_deg) / 2))
-        intrinsics = cropped_intrinsics(batch.intrinsics, *center_corner(batch.image, self.size))
+        intrinsics = cropped_intrinsics(batch.intrinsics, *center_corner(batch.image.shape[-2:], self.size))
         scale = torch.exp(spread[:, 3] * math.log1p(self.zoom))
         intrinsics[:, :2, :2] *= scale[:, None, None]
         homography = rotation_homography(batch.intrinsics, matrix_from_quaternion(cam_from_turned), intrinsics)
@@ -179,18 +178,13 @@ def filled_from_each_other(image: Tensor, holes: Tensor) -> Tensor:
 
 def center_crop(image: Tensor, crop: tuple[int, int]) -> Tensor:
     """Take the middle of a batch; (B, 3, H, W) uint8 -> (B, 3, *crop) float32 in 0..1."""
-    top, left = center_corner(image, crop)
+    top, left = center_corner(image.shape[-2:], crop)
     return image[..., top : top + crop[0], left : left + crop[1]].float() / 255
-
-
-def center_corner(images: Tensor | NDArray[np.uint8], crop: tuple[int, int]) -> tuple[int, int]:
-    """Row and column of the top-left pixel of a batch's centre crop; (B, 3, H, W) -> two numbers."""
-    return (images.shape[-2] - crop[0]) // 2, (images.shape[-1] - crop[1]) // 2
 
 
 def centered(batch: PoseBatch, crop: tuple[int, int]) -> PoseBatch:
     """Take the middle of a batch's images, as :func:`center_crop`; intrinsics follow."""
-    corner = center_corner(batch.image, crop)
+    corner = center_corner(batch.image.shape[-2:], crop)
     return replace(batch, image=center_crop(batch.image, crop), intrinsics=_cropped(batch, *corner))
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler
 
 from mambaloc import provenance
-from mambaloc.data.augmentation import Jitter, RandomCrop, RandomRotation, View, center_corner, centered, draw_uniforms
+from mambaloc.data.augmentation import Jitter, RandomCrop, RandomRotation, View, centered, draw_uniforms
 from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.frames import Frames, OnBadFrame, Split
 from mambaloc.data.scene import Scene
@@ -22,6 +22,7 @@ from mambaloc.data.splits import Validation
 from mambaloc.data.views import FramesAndViews, MixedSampler, SceneViews, ViewDepth
 from mambaloc.errors import InputError
 from mambaloc.geometry import cropped_intrinsics
+from mambaloc.images import center_corner
 from mambaloc.types import PoseBatch
 
 
@@ -141,7 +142,7 @@ class PoseDataModule(L.LightningDataModule):
     def train_intrinsics(self) -> Tensor:
         """Pinhole matrices of the training frames' centre crops, (N, 3, 3), in pixels."""
         data = self.scene.parts["train"].data
-        return cropped_intrinsics(data.intrinsics, *center_corner(data.images, self.crop))
+        return cropped_intrinsics(data.intrinsics, *center_corner(data.images.shape[-2:], self.crop))
 
     def listed_training_frames(self) -> Frames:
         """Read the whole training split's poses, without decoding an image.

@@ -1,6 +1,6 @@
 """Rotations, poses and cameras: torch only, conventions as in ``mambaloc.types``."""
 
-from mambaloc.geometry.cameras import cropped_intrinsics, grid_rays, project, resized_intrinsics
+from mambaloc.geometry.cameras import cropped_intrinsics, grid_rays, project, project_from_world, resized_intrinsics
 from mambaloc.geometry.homographies import rotation_homography, warped
 from mambaloc.geometry.poses import (
     compose,
@@ -43,6 +43,7 @@ __all__ = [
     "pose_from_matrix",
     "position_error_m",
     "project",
+    "project_from_world",
     "quaternion_from_log",
     "quaternion_from_matrix",
     "resized_intrinsics",

@@ -11,6 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from mambaloc.geometry.rotations import conjugate, normalize, rotate
+
 
 def project(points_cam_m: Tensor, intrinsics: Tensor) -> Tensor:
     """Pixels that points in camera coordinates fall on; meaningless unless their depth, ``z``, is positive.
@@ -20,6 +22,23 @@ def project(points_cam_m: Tensor, intrinsics: Tensor) -> Tensor:
     """
     homogeneous = (intrinsics * points_cam_m[..., None, :]).sum(dim=-1)  # no matmul: TF32 and autocast would round it
     return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+def project_from_world(
+    points_m: Tensor, position_m: Tensor, quaternion: Tensor, intrinsics: Tensor, near_m: float
+) -> tuple[Tensor, Tensor]:
+    """Pixels that world points fall on, and whether each lies farther than ``near_m`` in front of the camera.
+
+    A nearer point is projected as if it lay at that depth, so that no gradient is infinite.
+
+    Shape:
+        (B, P, 3), (B, 3), (B, 4) ``world_from_cam``, (B, 3, 3) -> (B, P, 2) ``(x, y)``, (B, P) bool.
+    """
+    cam_from_world = conjugate(normalize(quaternion))[:, None]
+    points_cam_m = rotate(cam_from_world, points_m - position_m[:, None])
+    depth_m = points_cam_m[..., 2:]
+    at_least_near_m = torch.cat((points_cam_m[..., :2], depth_m.clamp_min(near_m)), dim=-1)
+    return project(at_least_near_m, intrinsics[:, None]), depth_m[..., 0] > near_m
 
 
 def resized_intrinsics(intrinsics: Tensor, scale_x: Tensor | float, scale_y: Tensor | float) -> Tensor:

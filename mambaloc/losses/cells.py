@@ -6,9 +6,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mambaloc.geometry import conjugate, normalize, project, rotate
+from mambaloc.geometry import project_from_world, rotate
 from mambaloc.losses.weighted import pose_distances, weighed
 from mambaloc.types import CellPrediction, PoseBatch, PosePrediction
+
+_NEAR_M = 1e-6  # of a scene in any unit, all that lies in front of the camera
 
 
 class CellWeights(nn.Module):
@@ -98,14 +100,11 @@ def points_of_cells(target: PoseBatch, grid: tuple[int, int]) -> tuple[Tensor, T
     size = target.image.shape[-2:]
     is_point = target.points_m.isfinite().all(dim=-1)
     points_m = torch.where(is_point[..., None], target.points_m, 0.0)
-    cam_from_world = conjugate(normalize(target.quaternion))[:, None]
-    points_cam_m = rotate(cam_from_world, points_m - target.position_m[:, None])
-    is_ahead = is_point & (points_cam_m[..., 2] > 0)
-    points_px = project(torch.where(is_ahead[..., None], points_cam_m, 1.0), target.intrinsics[:, None])
+    points_px, is_ahead = project_from_world(points_m, target.position_m, target.quaternion, target.intrinsics, _NEAR_M)
     sides = torch.tensor((grid[1] / size[1], grid[0] / size[0]), device=points_px.device)
     place = (points_px + 0.5) * sides  # in cells
     column, row = place.floor().unbind(dim=-1)
-    is_inside = is_ahead & (row >= 0) & (row < grid[0]) & (column >= 0) & (column < grid[1])
+    is_inside = is_point & is_ahead & (row >= 0) & (row < grid[0]) & (column >= 0) & (column < grid[1])
     cell = torch.where(is_inside, row * grid[1] + column, float(grid[0] * grid[1])).long()  # the last one is for strays
     far = torch.where(is_inside, (place - place.floor() - 0.5).square().sum(dim=-1), torch.inf)
     nearest = far.new_full((len(cell), grid[0] * grid[1] + 1), torch.inf).scatter_reduce(1, cell, far, "amin")

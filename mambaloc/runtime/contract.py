@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import Image, center_cropped, resized, resized_size
+from mambaloc.images import Image, center_corner, center_cropped, resized, resized_size
 from mambaloc.runtime.maps.features import check_intrinsics
 
 VERSION = 1
@@ -62,7 +62,7 @@ class Preprocessing:
         """
         height, width = resized_size(size, self.short_side)
         y, x = height / size[0], width / size[1]
-        top, left = (height - self.crop[0]) // 2, (width - self.crop[1]) // 2
+        top, left = center_corner((height, width), self.crop)
         return np.array([[x, 0, (x - 1) / 2 - left], [0, y, (y - 1) / 2 - top], [0, 0, 1]])
 
     def holds_crop(self, size: tuple[int, int]) -> bool:

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
-from mambaloc.geometry import cropped_intrinsics, inverse, project, resized_intrinsics, transform
+from mambaloc.geometry import cropped_intrinsics, inverse, project, project_from_world, resized_intrinsics, transform
 from mambaloc.types import Pose
 
 K = torch.tensor([[585.0, 0, 320], [0, 570, 240], [0, 0, 1]], dtype=torch.float64)
@@ -28,6 +28,21 @@ def test_world_points_fall_where_opencv_projects_them():
         rvec = rotation.inv().as_rotvec()
         expected = cv2.projectPoints(points_m.numpy(), rvec, -rotation.inv().apply(position_m), K.numpy(), None)[0]
         np.testing.assert_allclose(pixels, expected[:, 0], rtol=1e-9, atol=1e-6)
+
+
+def test_points_in_front_fall_where_opencv_projects_them_and_none_makes_gradients_infinite():
+    rotation, position_m = Rotation.random(random_state=1), random(1, 3) + 5
+    quaternion = torch.from_numpy(rotation.as_quat(canonical=True)).roll(1)[None]
+    ahead, behind, at_the_lens = torch.tensor([[0.3, -0.2, 2.0], [0.3, 0.2, -2.0], [0.0, 0.0, 0.0]]).double()
+    points_m = (
+        transform(Pose(position_m, quaternion), torch.stack((ahead, behind, at_the_lens))[None])
+    ).requires_grad_()
+    pixels, is_ahead = project_from_world(points_m, position_m, quaternion, K[None], near_m=0.1)
+    assert is_ahead.tolist() == [[True, False, False]]
+    expected = cv2.projectPoints(ahead[None].numpy(), np.zeros(3), np.zeros(3), K.numpy(), None)[0]
+    np.testing.assert_allclose(pixels[0, 0].detach(), expected[0, 0], atol=1e-6)
+    pixels.sum().backward()
+    assert points_m.grad.isfinite().all()
 
 
 def test_intrinsics_of_a_batch_broadcast_over_its_points():
