@@ -67,6 +67,7 @@ class LitPoseRegressor(L.LightningModule):
         frozen_statistics: normalise by the statistics that the backbone starts with, in all of it: for one trained on
             many more images than the scene has.
         lr: learning rate of Adam, or its highest value.
+        beta2: decay of Adam's running mean of squared gradients; a training of few steps may learn faster with 0.99.
         weight_decay: L2 penalty, never on loss weights nor on a state-space mixer's A and D.
         schedule: ``step`` cuts the learning rate; ``cosine`` lets it fall to nothing over the whole training;
             ``one_cycle`` first lets it rise (Smith and Topin 2018). The last two need the training's length.
@@ -96,6 +97,7 @@ class LitPoseRegressor(L.LightningModule):
         feature_cache_gib: float = 0.0,
         frozen_statistics: bool = False,
         lr: float = 1e-4,
+        beta2: float = 0.999,
         weight_decay: float = 1e-4,
         schedule: Schedule = "step",
         lr_step_epochs: int = 100,
@@ -106,6 +108,9 @@ class LitPoseRegressor(L.LightningModule):
         self.image_size = height_and_width(image_size)
         self.loss = build_loss(loss, loss_args)
         self.lr, self.weight_decay, self.lr_step_epochs, self.lr_gamma = lr, weight_decay, lr_step_epochs, lr_gamma
+        if not 0 <= beta2 < 1:
+            raise InputError(f"model.beta2 {beta2:g}: must be 0 or more and less than 1. Adam's usual value is 0.999.")
+        self.beta2 = beta2
         if schedule not in get_args(Schedule):
             raise InputError(f"model.schedule {schedule!r}: choose one of {', '.join(get_args(Schedule))}")
         if compile_mode not in (None, *get_args(CompileMode)):
@@ -255,7 +260,7 @@ class LitPoseRegressor(L.LightningModule):
         """
         # Lightning refuses to clip a fused optimizer's gradients under mixed precision.
         clips = self._trainer is not None and bool(self.trainer.gradient_clip_val)
-        optimizer = build_adam(self, self.lr, self.weight_decay, fused=not clips)
+        optimizer = build_adam(self, self.lr, self.beta2, self.weight_decay, fused=not clips)
         if self.schedule == "step":
             by_epoch = torch.optim.lr_scheduler.StepLR(optimizer, self.lr_step_epochs, self.lr_gamma)
             return {"optimizer": optimizer, "lr_scheduler": by_epoch}

@@ -16,12 +16,13 @@ from mambaloc.errors import InputError
 Schedule = Literal["step", "cosine", "one_cycle"]
 
 
-def build_adam(module: nn.Module, lr: float, weight_decay: float, fused: bool) -> torch.optim.Adam:
+def build_adam(module: nn.Module, lr: float, beta2: float, weight_decay: float, fused: bool) -> torch.optim.Adam:
     """Adam over the trainable parameters; those that a submodule names in ``no_weight_decay()`` are not decayed.
 
     Args:
         module: what is trained.
         lr: learning rate.
+        beta2: decay of the running mean of squared gradients.
         weight_decay: L2 penalty.
         fused: read and write each parameter once a step, which saves a tenth of the time on a CPU.
     """
@@ -38,7 +39,7 @@ def build_adam(module: nn.Module, lr: float, weight_decay: float, fused: bool) -
         {"params": [p for p in trainable if id(p) in undecayed], "weight_decay": 0.0},
     ]
     groups = [group for group in groups if group["params"]]
-    return torch.optim.Adam(groups, lr=lr, betas=(0.9, 0.999), eps=1e-10, fused=fused)
+    return torch.optim.Adam(groups, lr=lr, betas=(0.9, beta2), eps=1e-10, fused=fused)
 
 
 def build_step_schedule(

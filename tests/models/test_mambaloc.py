@@ -171,6 +171,8 @@ def test_user_mistakes_come_through():
         small(backbone="mobilenet_v9")
     with pytest.raises(InputError, match="loss 'huber'"):
         small(loss="huber")
+    with pytest.raises(InputError, match=r"model\.beta2 1: must be 0 or more and less than 1"):
+        small(beta2=1.0)
 
 
 # --- training --------------------------------------------------------------------------------------------------------
@@ -184,6 +186,7 @@ def test_paper_defaults():
     assert [g["weight_decay"] for g in optimizer.param_groups] == [1e-4, 0.0]
     assert (scheduler.step_size, scheduler.gamma) == (100, 0.1)
     assert (system.loss.s_position.item(), system.loss.s_rotation.item()) == (-0.5, -6.5)
+    assert {g["betas"] for g in small(beta2=0.99).configure_optimizers()["optimizer"].param_groups} == {(0.9, 0.99)}
 
 
 def test_backbones_that_name_undecayed_parameters_by_dotted_names_train():
