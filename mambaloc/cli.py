@@ -116,6 +116,11 @@ class RecipeCLI(LightningCLI):
         config = self.config[self.subcommand]
         if config.get("retrieval") and not config.model.init_args.get("backbone_weights"):
             raise InputError("retrieval: this backbone starts from scratch, and finds nothing; set it to false")
+        if config.trainer.enable_checkpointing is False:
+            raise InputError(
+                "trainer.enable_checkpointing false: a run ends with the errors of its checkpoints. Leave it out; "
+                "best_checkpoint.save_top_k 0 keeps the last one alone."
+            )
         if config.data.validation == "none":
             config.best_checkpoint.save_top_k = 0
 
@@ -131,6 +136,12 @@ class RecipeCLI(LightningCLI):
         if not config.trainer.plugins:
             trainer.strategy.checkpoint_io = WholeCheckpoints()
         return trainer
+
+    def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[L.Callback]) -> L.Trainer:
+        """Leave the progress bar out where the recipe switches it off; Lightning refuses to."""
+        if config.get("enable_progress_bar") is False:
+            callbacks = [each for each in callbacks if not isinstance(each, PoseProgressBar)]
+        return super()._instantiate_trainer(config, callbacks)
 
     def fit(self, model: L.LightningModule, **kwargs: Any) -> None:
         """Train; an interrupted run says how to go on.

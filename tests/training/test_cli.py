@@ -62,6 +62,7 @@ def test_misplaced_recipe_is_refused(words, rule, tmp_path, monkeypatch):
         (["--ckpt_path", "nothing.ckpt"], ["nothing.ckpt"]),
         (["--data.image_size", "64"], ["short_side"]),
         (["--retrieval", "true"], ["retrieval", "scratch"]),
+        (["--trainer.enable_checkpointing", "false"], ["enable_checkpointing", "save_top_k"]),
     ],
 )
 def test_mistake_is_one_line_and_exit_code_2(options, words, tiny_recipe, capsys):
@@ -109,6 +110,7 @@ def test_predictions_agree_with_metrics(trained):
 @pytest.mark.slow
 def test_saved_config_retrains_the_same(trained, tmp_path):
     words = ["--onnx_export.enabled", "false", "--best_checkpoint.save_top_k", "0"]
+    words += ["--trainer.enable_progress_bar", "false"]
     main([str(trained / "config.yaml"), *words, "--trainer.default_root_dir", str(tmp_path / "again")])
     weights = [torch.load(r / "checkpoints/last.ckpt", weights_only=True) for r in (trained, tmp_path / "again")]
     torch.testing.assert_close(weights[0]["state_dict"], weights[1]["state_dict"], rtol=0, atol=0)
