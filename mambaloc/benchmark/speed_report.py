@@ -112,9 +112,9 @@ def print_programs(report: SpeedReport, console: Console) -> None:
     seconds = "seconds" if on_gpu else "CPU seconds of the process"
     memory = "by tensors on the GPU" if on_gpu else "of the process, libraries included"
     console.print(
-        f"Medians of {len(report.programs[0].turns)} turns [lowest, highest], each in a process of its own on one "
-        f"thread, A B C A B C. Same function, loss, batch size, dropout and optimiser. s: {seconds}. MiB: the most "
-        f"memory {memory}. Freed memory is kept for the next step, but by the program that says as it comes.",
+        f"Medians of {len(report.programs[0].turns)} turns, lowest and highest in brackets, each turn in a process of "
+        "its own on one thread, A B C A B C. Same function, loss, batch size, dropout and optimiser. "
+        f"s: {seconds}. MiB: the most memory {memory}. Freed memory is kept for the next step, but by the program that says as it comes.",
         soft_wrap=True,
     )
 

@@ -182,6 +182,7 @@ def test_the_report_is_printed_and_written(measured, tmp_path, capsys):
     said = capsys.readouterr().out
     for words in ("A step of 6 images", "as it comes", "backward", "seconds grow", "this machine"):
         assert words in said
+    assert "Medians of 2 turns, lowest and highest in brackets, each turn in a process" in said
     assert "…" not in said  # nothing is cut off at 80 columns
     assert "100.0 m on validation frames (sequences) after " in " ".join(said.split())
     write_report(report, tmp_path / "speed.json", "this machine")
