@@ -114,7 +114,8 @@ def print_programs(report: SpeedReport, console: Console) -> None:
     console.print(
         f"Medians of {len(report.programs[0].turns)} turns, lowest and highest in brackets, each turn in a process of "
         "its own on one thread, A B C A B C. Same function, loss, batch size, dropout and optimiser. "
-        f"s: {seconds}. MiB: the most memory {memory}. Freed memory is kept for the next step, but by the program that says as it comes.",
+        f"s: {seconds}. MiB: the most memory {memory}. Freed memory is kept for the next step, but by the program that "
+        "says as it comes.",
         soft_wrap=True,
     )
 

@@ -66,8 +66,8 @@ class LitPoseRegressor(L.LightningModule):
             a file; the steps then begin after them. It needs ``data.augmentation_draws``. 0 keeps nothing.
         frozen_statistics: normalise by the statistics that the backbone starts with, in all of it: for one trained on
             many more images than the scene has.
-        recomputed_stages: first stages of the backbone that a training step computes again in its backward pass: less
-            memory, more time, the same training.
+        recomputed_stages: first stages of the backbone that a training step computes again in its backward pass: more
+            time, the same training, and less memory where the C library gives freed memory back.
         lr: learning rate of Adam, or its highest value.
         weight_decay: L2 penalty, never on loss weights nor on a state-space mixer's A and D.
         schedule: ``step`` cuts the learning rate; ``cosine`` lets it fall to nothing over the whole training;
