@@ -29,16 +29,15 @@ def main() -> None:
     part.add_argument("--threads", type=thread_count, default=2)
     part.add_argument("--repetitions", type=whole_number(2), default=50)
     part.set_defaults(call=_deployment)
-    part = parts.add_parser("speed", help="where training time goes, beside the loop of published research code")
+    part = parts.add_parser("speed", help="seconds and memory of training steps, beside published programs")
     part.add_argument("system", nargs="?", default="mambaloc")
     part.add_argument("--overlay", type=Path, action="append", default=[], help="as recipes/overlays/ holds them")
     for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
         part.add_argument(name, default=default)
-    part.add_argument("--batches", type=whole_number(1), nargs="*", default=[16, 32], help="other images a step")
+    part.add_argument("--batch", type=whole_number(1), nargs="*", default=[], help="images a step; as published")
     part.add_argument("--frames", type=whole_number(2), nargs="*", default=[], help="of an epoch")
-    part.add_argument("--steps", type=whole_number(1), default=4, help="of a repetition")
-    part.add_argument("--repetitions", type=whole_number(2), default=5)
-    part.add_argument("--workers", type=whole_number(0), default=2, help="loader processes of the reference")
+    part.add_argument("--steps", type=whole_number(1), default=3, help="of a turn")
+    part.add_argument("--turns", type=whole_number(1), default=3, help="of each program, a process each")
     part.add_argument("--reach", type=float, metavar="METRES", help="train a process until then, and to the end")
     part.add_argument("--out", type=Path, help="a .json file for every figure")
     part.set_defaults(call=_speed)
@@ -63,11 +62,11 @@ def _speed(args: argparse.Namespace) -> None:
     if args.out and not args.out.parent.is_dir():
         raise InputError(f"{args.out}: there is no folder {args.out.parent}; make it first")
     scene = {"dataset": args.dataset, "root": args.root, "scene": args.scene, "validation": "block"}
-    setting = benchmark.Setting(model_class(args.system).registry_name, data=scene)
+    system = model_class(args.system).registry_name
+    setting = benchmark.Setting(system, data={**benchmark.PUBLISHED_DATA.get(system, {}), **scene})
     for overlay in args.overlay:
         setting = setting.with_overlay(overlay)
-    counts = {"steps": args.steps, "repetitions": args.repetitions, "workers": args.workers}
-    report = benchmark.measure_all(setting, args.batches, args.frames, **counts, sought_m=args.reach)
+    report = benchmark.measure_all(setting, args.batch, args.frames, args.steps, args.turns, args.reach)
     machine = provenance.machine(setting.device.index if setting.device.type == "cuda" else None)
     benchmark.print_report(report, machine)
     if args.out:

@@ -2,12 +2,14 @@
 
 from mambaloc.benchmark.deployment import Deployment, measure_deployment
 from mambaloc.benchmark.latency import Latency, forward_flops, measure_latency
+from mambaloc.benchmark.reference import PUBLISHED_DATA
 from mambaloc.benchmark.report import print_deployments, print_latencies, print_sizes
+from mambaloc.benchmark.setting import Setting
 from mambaloc.benchmark.sizes import Size, size_of, size_table
-from mambaloc.benchmark.speed import Setting
 from mambaloc.benchmark.speed_report import SpeedReport, measure_all, print_report, write_report
 
 __all__ = [
+    "PUBLISHED_DATA",
     "Deployment",
     "Latency",
     "Setting",

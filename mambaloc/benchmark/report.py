@@ -21,8 +21,8 @@ NOT_SHIPPED = f"\n* loses more than {LARGEST_LOSS:.0%} of its median error, so n
 
 
 def print_sizes(sizes: Sequence[Size]) -> None:
-    """Print a row a system and GIS: shipped, published accounting, and the paper's figure."""
-    table = new_table("Parameters", "system", "gis", "shipped", "MiB", "published", "MiB", "paper MiB")
+    """Print a row a system and GIS: ours, as published, and the paper's figure; and counts of published programs."""
+    table = new_table("Parameters", "system", "gis", "ours", "MiB", "published", "MiB", "paper MiB")
     notes = []
     for size in sizes:
         paper = "" if size.paper_mib is None else f"{size.paper_mib:.2f}"
@@ -31,6 +31,8 @@ def print_sizes(sizes: Sequence[Size]) -> None:
             paper += "*"
         cells = (f"{size.shipped:,}", f"{mib(size.shipped):.2f}", f"{size.published:,}", f"{mib(size.published):.2f}")
         table.add_row(size.system, size.gis, *cells, paper)
+        if size.program is not None:
+            notes.append(f"{size.system}: counted in the published program itself: {size.program:,}")
     console = Console(highlight=False)
     console.print(table)
     for line in notes + _replaced(sizes):

@@ -1,4 +1,4 @@
-"""All of speed in one run: measured, as tables in the terminal with ratios first, and as JSON."""
+"""All of speed in one run: measured, as tables in the terminal, and as JSON."""
 
 from __future__ import annotations
 
@@ -12,19 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from mambaloc import provenance
-from mambaloc.benchmark.footprint import Footprint, exponent, measure_footprints, measure_scaling
+from mambaloc.benchmark.clock import PARTS
+from mambaloc.benchmark.footprint import Footprint, exponent, measure_scaling
 from mambaloc.benchmark.report import new_table
-from mambaloc.benchmark.speed import (
-    LOOP_ALONE,
-    OURS,
-    PARTS,
-    REFERENCE,
-    Setting,
-    Speed,
-    check_speed,
-    measure_speed,
-    ratio,
-)
+from mambaloc.benchmark.setting import Setting
+from mambaloc.benchmark.speed import OURS, Program, measure_speed, times_as_long
 from mambaloc.benchmark.whole_training import WholeTraining, check_whole_training, measure_whole_training
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
@@ -36,49 +28,43 @@ class SpeedReport:
 
     Args:
         setting: what was trained on what.
-        speed: images a second, parts of a step.
-        footprints: memory and seconds to the first step.
-        scaling: the same for whole epochs, by frames.
+        programs: steps, ours and the published.
+        scaling: whole epochs, by frames.
         whole: a training to its end, if an error was sought.
     """
 
     setting: Setting
-    speed: Speed
-    footprints: list[Footprint]
+    programs: list[Program]
     scaling: list[Footprint]
     whole: WholeTraining | None = None
 
 
 def measure_all(
     setting: Setting,
-    batches: Sequence[int] = (16, 32),
+    batches: Sequence[int] = (),
     frames: Sequence[int] = (),
-    steps: int = 4,
-    repetitions: int = 5,
-    workers: int = 2,
+    steps: int = 3,
+    turns: int = 3,
     sought_m: float | None = None,
 ) -> SpeedReport:
     """Measure everything, one thing after another.
 
     Args:
         setting: what is trained on what.
-        batches: images a step to try, beside the setting's own.
+        batches: images a step; the setting's own unless given.
         frames: of the trainings whose epochs are timed whole.
-        steps: of a repetition.
-        repetitions: timed, after one that warms up.
-        workers: loader processes of the reference.
+        steps: of a turn, after one that warms up.
+        turns: of each program.
         sought_m: median position error to train a process from its start for, if any.
 
     Raises:
-        InputError: for too few repetitions to tell a spread, or a scene with too few frames.
+        InputError: for what cannot be measured on this scene.
     """
     _check(setting, frames, sought_m)
-    check_speed(setting.build()[1], batches, steps, repetitions)
-    footprints = measure_footprints(setting, steps, workers)
-    speed = measure_speed(setting, batches, steps, repetitions, workers)
+    programs = measure_speed(setting, batches, steps, turns)
     scaling = measure_scaling(setting, frames)
     whole = None if sought_m is None else measure_whole_training(setting, sought_m)
-    return SpeedReport(setting, speed, footprints, scaling, whole)
+    return SpeedReport(setting, programs, scaling, whole)
 
 
 def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> None:
@@ -100,13 +86,12 @@ def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> N
 def print_report(report: SpeedReport, machine: str) -> None:
     """Print every part that was measured."""
     console = Console(highlight=False)
-    print_speed(report.speed, console)
-    print_footprints(report.footprints, console)
+    print_programs(report, console)
     if report.scaling:
         print_scaling(report.scaling, console)
     if report.whole:
         print_whole_training(report.whole, console)
-    console.print(f"{report.setting.system}, medians; {machine}", soft_wrap=True)
+    console.print(f"{report.setting.system}; {machine}", soft_wrap=True)
 
 
 def write_report(report: SpeedReport, path: Path, machine: str) -> None:
@@ -116,48 +101,48 @@ def write_report(report: SpeedReport, path: Path, machine: str) -> None:
         partial.write_text(json.dumps(told, indent=1, default=str), encoding="utf-8")
 
 
-def print_speed(speed: Speed, console: Console) -> None:
-    """Print training and evaluation beside the reference, then where a step's time goes."""
-    table = new_table("Images a second", "what", "ratio", "± IQR", "ours", "reference")
-    _rates(table, "training", speed.training[OURS], speed.training[REFERENCE])
-    if LOOP_ALONE in speed.training:
-        _rates(table, "training, our network in it", speed.training[OURS], speed.training[LOOP_ALONE])
-    _rates(table, "evaluation, the reference one at a time", speed.evaluation[OURS], speed.evaluation[REFERENCE])
-    console.print(table)
-    best = max(speed.batches, key=lambda size: median(speed.batches[size]))
-    rates = ", ".join(f"{size}: {median(found):.1f}" for size, found in speed.batches.items())
-    console.print(f"images/s by images a step: {rates}; best {best}", soft_wrap=True)
-    seconds = 1000 / median(speed.training[OURS]), 1000 / median(speed.training[REFERENCE])
-    console.print(f"1000 frames in steps of {speed.batch}: {seconds[0]:.1f} s, the reference {seconds[1]:.1f} s")
-    console.print(_parts(speed))
+def print_programs(report: SpeedReport, console: Console) -> None:
+    """Print seconds and memory of a step beside the published program's, then its parts, by batch and dropout."""
+    on_gpu = report.setting.device.type == "cuda"
+    for ours in (program for program in report.programs if program.name == OURS):
+        beside = [program for program in report.programs if program.is_beside(ours)]
+        dropout = "" if ours.attention_dropout is None else f", attention dropout {ours.attention_dropout:g}"
+        console.print(_steps(f"A step of {ours.batch} images{dropout}", ours, beside, on_gpu))
+        console.print(_parts([program for program in beside if program.keeps_memory]))
+    seconds = "seconds" if on_gpu else "CPU seconds of the process"
+    memory = "by tensors on the GPU" if on_gpu else "of the process, libraries included"
+    console.print(
+        f"Medians of {len(report.programs[0].turns)} turns, lowest and highest in brackets, each turn in a process of "
+        "its own on one thread, A B C A B C. Same function, loss, batch size, dropout and optimiser. "
+        f"s: {seconds}. MiB: the most memory {memory}. Freed memory is kept for the next step, but by the program that "
+        "says as it comes.",
+        soft_wrap=True,
+    )
 
 
-def _rates(table: Table, what: str, ours: Sequence[float], theirs: Sequence[float]) -> None:
-    times, spread = ratio(ours, theirs)
-    table.add_row(what, f"{times:.2f}", f"{spread:.2f}", f"{median(ours):.1f}", f"{median(theirs):.1f}")
-
-
-def _parts(speed: Speed) -> Table:
-    table = new_table(f"Milliseconds of a step of {speed.batch} images", "part", "ours", "share", "reference", "share")
-    medians = {way: {part: median(taken) for part, taken in of_each.items()} for way, of_each in speed.parts.items()}
-    totals = {way: sum(of_each.values()) for way, of_each in medians.items()}
-    for part in PARTS:
-        cells = []
-        for way in (OURS, REFERENCE):
-            seconds = medians[way].get(part)
-            cells += ["", ""] if seconds is None else [f"{1000 * seconds:.2f}", f"{seconds / totals[way]:.1%}"]
-        table.add_row("Lightning's trainer" if part == "trainer" else part, *cells)
-    table.add_row("all", *(cell for way in (OURS, REFERENCE) for cell in (f"{1000 * totals[way]:.2f}", "")))
+def _steps(title: str, ours: Program, programs: Sequence[Program], on_gpu: bool) -> Table:
+    table = new_table(title, "way", "s", "times ours", "MiB", "times")
+    for program in programs:
+        ratios = "", ""
+        memory, own = (each.device_bytes if on_gpu else each.host_bytes for each in (program, ours))
+        if program is not ours:
+            ratios = _with_range(times_as_long(program, ours)), f"{memory / own:.2f}"
+        name = program.name if program.keeps_memory else f"{program.name}, as it comes"
+        seconds = _with_range([turn.step_s for turn in program.turns])
+        table.add_row(name, seconds, ratios[0], f"{memory / 2**20:.0f}", ratios[1])
     return table
 
 
-def print_footprints(footprints: Sequence[Footprint], console: Console) -> None:
-    """Print memory and seconds to the first step, ours and the reference's, each in a process of its own."""
-    table = new_table("A process of its own", "way", "to the first step s", "host MiB", "device MiB")
-    for each in footprints:
-        memory = (f"{size / 2**20:.0f}" for size in (each.host_bytes, each.device_bytes))
-        table.add_row(each.way, f"{each.first_step_s:.1f}", *memory)
-    console.print(table)
+def _with_range(values: Sequence[float]) -> str:
+    return f"{median(values):.2f} [{min(values):.2f}, {max(values):.2f}]"
+
+
+def _parts(programs: Sequence[Program]) -> Table:
+    table = new_table("in milliseconds", "way", *PARTS)
+    for program in programs:
+        medians = [median(s for turn in program.turns for s in turn.parts_s[part]) for part in PARTS]
+        table.add_row(program.name, *(f"{1000 * seconds:.0f}" if seconds else "" for seconds in medians))
+    return table
 
 
 def print_scaling(footprints: Sequence[Footprint], console: Console) -> None:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import lightning as L
 from lightning.pytorch.utilities.types import STEP_OUTPUT
 
+from mambaloc.benchmark.clock import now
 from mambaloc.benchmark.footprint import in_a_process
-from mambaloc.benchmark.speed import Setting, now
+from mambaloc.benchmark.setting import Setting
 from mambaloc.errors import InputError
 
 

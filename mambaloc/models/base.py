@@ -22,7 +22,7 @@ from mambaloc.models.compiling import CompileMode, compile_forward
 from mambaloc.models.feature_cache import FeatureCache
 from mambaloc.models.optim import Schedule, build_adam, build_step_schedule, check_span, training_steps
 from mambaloc.models.weights import build_from, read_checkpoint, start_from
-from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale, SplitBackbone
+from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale, SplitBackbone, recompute_stages
 from mambaloc.types import PoseBatch, PosePrediction, height_and_width
 
 BACKBONE_ARGUMENTS = {
@@ -66,6 +66,8 @@ class LitPoseRegressor(L.LightningModule):
             a file; the steps then begin after them. It needs ``data.augmentation_draws``. 0 keeps nothing.
         frozen_statistics: normalise by the statistics that the backbone starts with, in all of it: for one trained on
             many more images than the scene has.
+        recomputed_stages: first stages of the backbone that a training step computes again in its backward pass: more
+            time, the same training, and less memory where the C library gives freed memory back.
         lr: learning rate of Adam, or its highest value.
         beta2: decay of Adam's running mean of squared gradients; a training of few steps may learn faster with 0.99.
         weight_decay: L2 penalty, never on loss weights nor on a state-space mixer's A and D.
@@ -96,6 +98,7 @@ class LitPoseRegressor(L.LightningModule):
         frozen_groups: int = 0,
         feature_cache_gib: float = 0.0,
         frozen_statistics: bool = False,
+        recomputed_stages: int = 0,
         lr: float = 1e-4,
         beta2: float = 0.999,
         weight_decay: float = 1e-4,
@@ -134,6 +137,8 @@ class LitPoseRegressor(L.LightningModule):
             self.network.backbone.freeze(frozen_groups)
         if frozen_statistics:
             self.network.backbone.freeze_statistics()
+        if recomputed_stages:
+            recompute_stages(self.network.backbone.model, self.network.backbone.name, recomputed_stages)
 
     def configure_network(self) -> PoseNetwork:
         """Build the network from the hyperparameters: images in, :class:`~mambaloc.types.PosePrediction` out."""

@@ -7,6 +7,7 @@ from mambaloc.nn.frozen import SplitBackbone
 from mambaloc.nn.gis import GISMode, GlobalInformationSelector, build_gis
 from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation
 from mambaloc.nn.network import PoseNetwork
+from mambaloc.nn.recomputed import recompute_stages
 from mambaloc.nn.ssm import Discretisation, MambaMixer, selective_scan
 
 __all__ = [
@@ -29,5 +30,6 @@ __all__ = [
     "SplitBackbone",
     "TokenEncoder",
     "build_gis",
+    "recompute_stages",
     "selective_scan",
 ]

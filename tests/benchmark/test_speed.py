@@ -1,40 +1,34 @@
-"""Speed: the reference computes what we do, every figure is measured, and the arithmetic is right."""
+"""Speed: every figure is measured, alike on both sides, and the arithmetic is right."""
 
 import json
 import os
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from rich.console import Console
 
-from mambaloc.benchmark import Setting, footprint, measure_all, print_report, whole_training, write_report
-from mambaloc.benchmark.footprint import (
-    Footprint,
-    exponent,
-    in_a_process,
-    measure_footprints,
-    measure_scaling,
-    peak_bytes,
+from mambaloc.benchmark import (
+    Setting,
+    SpeedReport,
+    footprint,
+    measure_all,
+    print_report,
+    speed,
+    whole_training,
+    write_report,
 )
-from mambaloc.benchmark.reference import DecodedFrames, Published, ReferenceLoop
-from mambaloc.benchmark.speed import LOOP_ALONE, OURS, PARTS, REFERENCE, measure_speed, ratio
+from mambaloc.benchmark.clock import PARTS, StepClock
+from mambaloc.benchmark.footprint import Footprint, exponent, in_a_process, measure_scaling, peak_bytes
+from mambaloc.benchmark.speed import OURS, REFERENCE, Program, Turn, measure_speed, times_as_long
 from mambaloc.benchmark.speed_report import print_scaling
 from mambaloc.benchmark.whole_training import measure_whole_training
-from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.models import create_model
 
 TINY_BACKBONE = "test_efficientnet"  # timm's own for tests
 SMALL = {"dim": 32, "heads": 4, "encoder_layers": 2, "feedforward": 32, "head_hidden": 32}
-
-
-@pytest.fixture
-def data(scenes):
-    module = PoseDataModule("7scenes", str(scenes), "heads", 32, 36, validation="sequences", batch_size=4)
-    module.setup("fit")
-    return module
 
 
 @pytest.fixture(scope="module")
@@ -43,63 +37,46 @@ def setting(scenes):
     return Setting("mambaloc", {"backbone": TINY_BACKBONE, **SMALL}, {**scene, "validation": "sequences"})
 
 
-@pytest.mark.parametrize("backbone", ["resnet10t", "mobilenetv3_small_050"])
-@pytest.mark.parametrize("gis", ["none", "gis"])
-def test_published_form_is_the_same_function(backbone, gis):
-    torch.manual_seed(0)
-    system = create_model("mambaloc", backbone=backbone, gis=gis, image_size=64, **SMALL).eval()
-    published = Published(system).eval()
-    image = torch.rand(2, 3, 64, 64)
-    ours, theirs = system(image), published(system.network.backbone.normalised(image))
-    torch.testing.assert_close(theirs.position_m, ours.position_m, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(theirs.quaternion, ours.quaternion, rtol=1e-5, atol=1e-6)
+def test_a_clock_counts_computing_not_waiting():
+    clock = StepClock(torch.device("cpu"))
+    time.sleep(0.3)
+    clock.mark("load")
+    clock.end_step()
+    assert clock.parts_s["load"][0] < 0.1
 
 
-def test_published_form_leaves_our_network_as_it_was():
-    system = create_model("mambaloc", backbone="resnet10t", image_size=64, **SMALL)
-    Published(system)
-    assert {layer.attention_dropout for layer in system.network.position_encoder.layers} == {0.0}
+@pytest.mark.parametrize("option", [{"clip_length": 3}, {"points_per_frame": 8}])
+def test_what_the_published_loop_cannot_load(option, setting):
+    with pytest.raises(InputError, match="loads no clips and no scene points"):
+        measure_speed(replace(setting, data={**setting.data, **option}))
 
 
-def test_published_backbone_runs_stages_that_nobody_reads():
-    system = create_model("mambaloc", backbone="resnet10t", image_size=64, **SMALL)
-    loss = Published(system)(torch.rand(2, 3, 64, 64)).position_m.sum()
-    loss.backward()
-    whole = Published(system).backbone
-    assert len(whole(torch.rand(1, 3, 64, 64))) == 5
+def program(name, seconds, mib, keeps=True, dropout=0.1):
+    """A program of 8 images; a turn of two steps for each number of seconds."""
+    parts_s = [{"load": [0.25 * s] * 2, "forward": [0.75 * s] * 2} for s in seconds]
+    turns = [Turn({**dict.fromkeys(PARTS, [0.0] * 2), **of_each}, mib * 2**20, 0) for of_each in parts_s]
+    return Program(name, 8, dropout, keeps, tuple(turns))
 
 
-def test_reference_decodes_what_the_cache_holds(data):
-    """Of one frame in the centre: resized by PIL there, by OpenCV here."""
-    frames = DecodedFrames(data, [0.0] * 3, [1.0] * 3, "val")
-    image, position_m, quaternion = frames[3]
-    batch = data.on_after_batch_transfer(next(iter(data.val_dataloader())), 0)
-    assert image.shape == batch.image[3].shape
-    assert (image - batch.image[3]).abs().mean() < 0.02
-    assert torch.equal(position_m, batch.position_m[3])
-    assert torch.equal(quaternion, batch.quaternion[3])
-
-
-def test_reference_learns(data):
-    torch.manual_seed(0)
-    system = create_model("mambaloc", backbone=TINY_BACKBONE, image_size=32, lr=1e-3, **SMALL)
-    loop = ReferenceLoop(system, data, Published(system), 12, torch.device("cpu"), 0)
-    losses = [loss for _ in range(4) for loss in loop.train()]
-    assert len(losses) == 48
-    assert sum(losses[-12:]) < 0.6 * sum(losses[:12])
-    assert loop.evaluate(loop.loader("val", 1, 5)) == 5
-
-
-def test_ratios_by_hand():
-    times, spread = ratio([2.0, 4.0, 6.0, 8.0], [1.0, 2.0, 3.0, 2.0])
-    assert times == 5 / 2
-    assert spread == pytest.approx(1.5)  # of 2, 2, 2 and 4: quartiles 2 and 3.5
+def test_ratios_by_hand(capsys):
+    ours, theirs = program(OURS, [2.0, 4.0, 3.0], 1000), program(REFERENCE, [4.0, 6.0, 9.0], 1500)
+    assert times_as_long(theirs, ours) == [2, 1.5, 3]
+    as_it_comes, other = (replace(theirs, keeps_memory=False), program(OURS, [9.0], 7, dropout=0.0))
+    assert not theirs.is_beside(other)
+    print_report(SpeedReport(Setting("atloc"), [ours, theirs, as_it_comes], []), "this machine")
+    said = capsys.readouterr().out
+    assert "A step of 8 images, attention dropout 0.1" in said
+    rows = [" ".join(line.split()) for line in said.splitlines()]
+    assert "ours 3.00 [2.00, 4.00] 1000" in rows
+    assert "published 6.00 [4.00, 9.00] 2.00 [1.50, 3.00] 1500 1.50" in rows
+    assert "published, as it comes 6.00 [4.00, 9.00] 2.00 [1.50, 3.00] 1500 1.50" in rows
+    assert "ours 750 2250" in rows  # load and forward
 
 
 def test_exponents_by_hand(capsys):
     assert exponent([250, 500, 1000], [1.0, 2.0, 4.0]) == pytest.approx(1)
     assert exponent([10, 20, 40], [3.0, 3.0, 3.0]) == pytest.approx(0, abs=1e-9)
-    grown = [Footprint(OURS, n, 9.0, n / 500, 2**20 * 700, 0) for n in (250, 500, 1000)]
+    grown = [Footprint(n, n / 500, 2**20 * 700, 0) for n in (250, 500, 1000)]
     print_scaling(grown, Console(highlight=False))
     said = capsys.readouterr().out
     assert "seconds grow as frames to the 1.00, host memory to the 0.00" in said
@@ -136,30 +113,23 @@ def test_no_overlay(text, message, tmp_path):
         Setting("mambaloc").with_overlay(path)
 
 
-def test_speed_needs_repetitions(setting):
-    with pytest.raises(InputError, match="--repetitions 3: quartiles need 4"):
-        measure_speed(setting, repetitions=3)
-
-
 def test_speed_needs_frames(setting):
-    with pytest.raises(InputError, match="--steps 4: in batches of 8 they need more than the scene's 12 frames"):
-        measure_speed(setting, batches=[8], steps=4)
+    with pytest.raises(InputError, match="--batch 13: the scene has 12 frames"):
+        measure_speed(setting, batches=[4, 13])
 
 
 @pytest.fixture(scope="module")
 def measured(setting):
     """Everything, measured in this process, since new ones would import torch each time; and the seconds it took."""
     trained = replace(setting, model={**setting.model, "lr": 1e-3}, trainer={"max_epochs": 2})
+    threads = torch.get_num_threads()
     with pytest.MonkeyPatch.context() as patch:
-        for module in (footprint, whole_training):
+        for module in (footprint, speed, whole_training):
             patch.setattr(module, "in_a_process", lambda measure, *args: measure(*args))
-        start = time.perf_counter()
-        report = measure_all(trained, batches=[6], frames=[6, 12], steps=2, repetitions=4, workers=1, sought_m=100.0)
-        return report, time.perf_counter() - start
-
-
-def check_footprints(footprints):
-    assert all(each.first_step_s > 0 and each.host_bytes > 2**27 for each in footprints)
+        start = time.process_time()
+        report = measure_all(trained, batches=[4, 6], frames=[6, 12], steps=3, turns=2, sought_m=100.0)
+        torch.set_num_threads(threads)
+        return report, time.process_time() - start
 
 
 def check_whole_training(whole, frames, steps):
@@ -169,32 +139,56 @@ def check_whole_training(whole, frames, steps):
 
 
 def test_every_figure_is_measured(measured):
-    report, taken = measured
-    assert set(report.speed.training) == {OURS, REFERENCE, LOOP_ALONE}
-    assert set(report.speed.batches) == {4, 6}
-    assert set(report.speed.parts[OURS]) == set(PARTS)
-    for rates in (*report.speed.training.values(), *report.speed.evaluation.values(), *report.speed.batches.values()):
-        assert len(rates) == 4
-        assert min(rates) > 0
-    seconds = [s for rates in report.speed.training.values() for s in (8 / rate for rate in rates)]
-    assert sum(seconds) < taken  # of steps of 4 images: nothing is counted twice
-    assert all(min(taken) >= 0 for way in report.speed.parts.values() for taken in way.values())
-    assert [each.way for each in report.footprints] == [OURS, REFERENCE]
+    report, taken_s = measured
+    ways = [(each.name, each.batch, each.attention_dropout, each.keeps_memory) for each in report.programs]
+    assert ways == [
+        (name, batch, dropout, keeps)
+        for batch in (4, 6)
+        for dropout in (0.0, 0.1)
+        for name, keeps in ((OURS, True), (REFERENCE, True), (REFERENCE, False))
+    ]
+    turns = [turn for each in report.programs for turn in each.turns]
+    assert len(turns) == 2 * len(ways)
+    assert {len(seconds) for turn in turns for seconds in turn.parts_s.values()} == {3}
+    assert min(turn.step_s for turn in turns) > 0
+    assert 3 * sum(turn.step_s for turn in turns) < 1.5 * taken_s  # medians; nothing is counted twice
+    for turn in report.programs[0].turns:  # ours has every part
+        assert all(max(seconds) > 0 for seconds in turn.parts_s.values())
     assert [each.frames for each in report.scaling] == [6, 12]
-    check_footprints([*report.footprints, *report.scaling])
+    assert all(each.host_bytes > 2**27 for each in (*turns, *report.scaling))
     check_whole_training(report.whole, frames=12, steps=6)
+
+
+def test_both_sides_train_with_the_same_dropout_and_allocator(setting, monkeypatch):
+    said = []
+    monkeypatch.setattr(speed, "keep_freed_memory", lambda: said.append("kept"))
+    monkeypatch.setattr(speed, "peak_bytes", lambda: 0)
+
+    def loop(system, data, device):
+        said.append((system.hparams["attention_dropout"], data.hparams["batch_size"], torch.get_num_threads()))
+        return SimpleNamespace(train=lambda steps, clock: None)
+
+    monkeypatch.setattr(speed, "ReferenceLoop", loop)
+    threads = torch.get_num_threads()
+    for keeps in (True, False):
+        speed.measure_turn(setting, Program(REFERENCE, 6, 0.1, keeps), 1)
+    torch.set_num_threads(threads)
+    assert said == ["kept", (0.1, 6, 1), (0.1, 6, 1)]
 
 
 def test_the_report_is_printed_and_written(measured, tmp_path, capsys):
     report, _ = measured
     print_report(report, "this machine")
     said = capsys.readouterr().out
-    for words in ("training", "evaluation", "backward", "reference", "first step", "seconds grow", "this machine"):
+    for words in ("A step of 6 images", "as it comes", "backward", "seconds grow", "this machine"):
         assert words in said
+    assert "Medians of 2 turns, lowest and highest in brackets, each turn in a process" in said
+    assert "…" not in said  # nothing is cut off at 80 columns
     assert "100.0 m on validation frames (sequences) after " in " ".join(said.split())
     write_report(report, tmp_path / "speed.json", "this machine")
     told = json.loads((tmp_path / "speed.json").read_text())
-    assert told["speed"]["training"][OURS] == report.speed.training[OURS]
+    first = told["programs"][0]
+    assert first["turns"][0]["parts_s"]["forward"] == report.programs[0].turns[0].parts_s["forward"]
     assert told["setting"]["system"] == "mambaloc"
     with pytest.raises(InputError, match="cannot be written"):
         write_report(report, tmp_path / "nowhere/speed.json", "this machine")
@@ -207,8 +201,10 @@ def test_a_process_is_new():
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_processes_of_their_own(setting):
-    """Five that import torch; what they measure, the tests above guard in one."""
-    check_footprints([*measure_footprints(setting, 2, 1), *measure_scaling(setting, [6, 12])])
+    """Nine that import torch; what they measure, the tests above guard in one."""
+    programs = measure_speed(setting, [4], steps=1, turns=1)
+    assert len(programs) == 6
+    assert all(each.host_bytes > 2**27 for each in (*programs, *measure_scaling(setting, [6, 12])))
     trained = replace(
         setting,
         model={**setting.model, "lr": 1e-3},
@@ -227,7 +223,10 @@ def test_a_training_that_reaches_nothing(data, trainer, message):
         measure_whole_training(Setting("mambaloc", {}, data, trainer), 0.1)
 
 
-def test_a_system_without_a_published_form_is_measured_beside_the_loop(setting):
+def test_a_system_without_a_published_form_is_measured_alone(setting, monkeypatch):
+    monkeypatch.setattr(speed, "in_a_process", lambda measure, *args: measure(*args))
+    threads = torch.get_num_threads()
     student = Setting("student", {"backbone": TINY_BACKBONE, "width": 16}, setting.data)
-    speed = measure_speed(student, batches=[], steps=2, repetitions=4, workers=0)
-    assert set(speed.training) == {OURS, REFERENCE}
+    (alone,) = measure_speed(student, steps=1, turns=1)
+    torch.set_num_threads(threads)
+    assert (alone.name, alone.batch, alone.attention_dropout) == (OURS, 4, None)

@@ -51,8 +51,8 @@ def main() -> None:
 def measure_loading(data: PoseDataModule, batches: int = 32, repetitions: int = 5) -> LoadingRates:
     """Time both ways from disk to a normalised, augmented float batch, alternating, after a warm-up of each.
 
-    The reference is what published research code does: PIL, resize, random crop, colour jitter, normalise, a frame at
-    a time. Neither uses a second core.
+    The reference is what AtLoc's program does: PIL, resize, random crop, colour jitter, normalise, a frame at a time.
+    Neither uses a second core.
 
     Args:
         data: the scene; its training frames are loaded.
