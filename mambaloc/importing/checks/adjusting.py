@@ -117,7 +117,8 @@ def _focal(
     """The focal length of the pinhole that is nearest to each lens where pictures have keypoints, over that given."""
     found = {}
     for number, (name, lens) in enumerate(zip(names, lenses, strict=True)):
-        ideal = lens.undistort(np.concatenate([features[row].rays for row in np.flatnonzero(camera == number)]))
+        rays = [each.rays for each, own in zip(features, camera == number, strict=True) if own]
+        ideal = lens.undistort(np.concatenate(rays))
         found[name] = float((lens.distort(ideal) * ideal).sum() / max((ideal**2).sum(), 1e-12))
     return found
 
