@@ -13,7 +13,7 @@ from mambaloc.data.frames import Frames
 from mambaloc.errors import InputError
 from mambaloc.images import Image, read_image
 from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
-from mambaloc.runtime.maps.acceptance import CALIBRATION, LEAST_PROBABILITY, RULE
+from mambaloc.runtime.maps.acceptance import CALIBRATION, LEAST_PROBABILITY, MOST_DEVIATION, RULE
 from mambaloc.runtime.maps.radii import LEVEL
 from mambaloc.runtime.maps.viewpoints import spread_m
 from mambaloc.runtime.rotations import rotation_error_deg
@@ -75,6 +75,7 @@ def describe_map(sparse_map: SparseMap) -> dict[str, Any]:
         "accepted": {
             "rule": RULE,
             "least_probability": LEAST_PROBABILITY,
+            "most_deviation": MOST_DEVIATION,
             "least_inliers": sparse_map.least_inliers,
             "calibrated_on": CALIBRATION,
         },

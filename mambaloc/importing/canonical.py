@@ -22,7 +22,8 @@ from mambaloc.importing.splits.selection import RULE, Chosen, Proposal
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
 ADJUSTED_FILE = "frames_adjusted.csv"
-"""Beside ``frames.csv``, in its form: poses that were adjusted to the pictures. Nothing reads it by itself."""
+"""Beside ``frames.csv``, in its form: poses that were adjusted to the pictures, and the names of cameras that were,
+which ``scene.json`` has beside those given. Nothing reads it by itself."""
 
 POSE = (
     "world_from_cam: x, y, z is the camera centre, qw, qx, qy, qz a unit quaternion with qw >= 0; OpenCV camera axes "
@@ -60,6 +61,12 @@ class Imported:
     adjusted: NDArray[np.float64] | None = None
 
     @property
+    def focal(self) -> Mapping[str, float]:
+        """Adjusted focal lengths over those given, by camera."""
+        found = None if self.agreement is None else self.agreement.adjusted
+        return {} if found is None else found.focal
+
+    @property
     def unit(self) -> str:
         """How a length's unit is written."""
         return "m" if self.capture.unit == "metre" else "units"
@@ -67,12 +74,15 @@ class Imported:
 
 def write_frames(imported: Imported, folder: Path) -> None:
     """Write ``frames.csv``, and adjusted poses beside it; numbers as exactly as they are known."""
-    _write_poses(imported, imported.capture.world_from_cam, folder, FRAMES_FILE)
+    _write_poses(imported, imported.capture.world_from_cam, folder, FRAMES_FILE, {})
     if imported.adjusted is not None:
-        _write_poses(imported, imported.adjusted, folder, ADJUSTED_FILE)
+        renamed = {name: _adjusted(name) for name in imported.focal}
+        _write_poses(imported, imported.adjusted, folder, ADJUSTED_FILE, renamed)
 
 
-def _write_poses(imported: Imported, world_from_cam: NDArray[np.float64], folder: Path, name: str) -> None:
+def _write_poses(
+    imported: Imported, world_from_cam: NDArray[np.float64], folder: Path, name: str, renamed: Mapping[str, str]
+) -> None:
     capture = imported.capture
     quaternions = quaternion_from_matrix(world_from_cam[:, :3, :3])
     poses = zip(world_from_cam[:, :3, 3].tolist(), quaternions.tolist(), strict=True)
@@ -82,6 +92,7 @@ def _write_poses(imported: Imported, world_from_cam: NDArray[np.float64], folder
         for row, (position, quaternion) in enumerate(poses):
             time_s = "" if capture.time_s is None else repr(float(capture.time_s[row]))
             camera = "" if capture.camera_of is None else capture.camera_of[row]
+            camera = renamed.get(camera, camera)
             image = capture.images[row].relative_to(folder).as_posix()
             pose = [repr(number) for number in (*position, *quaternion)]
             writer.writerow([image, capture.sequences[row] or "all", time_s, *pose, camera, imported.split[row]])
@@ -97,6 +108,10 @@ def write_scene(imported: Imported, folder: Path, source: Path, command: str) ->
         command: that made it.
     """
     capture = imported.capture
+    cameras = {name: _described(camera, imported.lenses[name]) for name, camera in capture.cameras.items()}
+    for name, scale in imported.focal.items():
+        focal_px = [scale * each for each in capture.cameras[name].focal_px]
+        cameras[_adjusted(name)] = {**cameras[name], "focal_px": focal_px, "adjusted_from": name}
     told = {
         VERSION_KEY: VERSION,
         "imported": {
@@ -110,7 +125,7 @@ def write_scene(imported: Imported, folder: Path, source: Path, command: str) ->
         "pose": POSE,
         "unit": "metre" if capture.unit == "metre" else _UNKNOWN,
         "choices": dict(capture.choices),
-        "cameras": {name: _described(camera, imported.lenses[name]) for name, camera in capture.cameras.items()},
+        "cameras": cameras,
         "frames": {
             "used": len(capture.images),
             "poses_without_image": len(capture.poses_without_image),
@@ -131,6 +146,11 @@ def write_scene(imported: Imported, folder: Path, source: Path, command: str) ->
         "split": _split(imported),
     }
     (folder / SCENE_FILE).write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _adjusted(camera: str) -> str:
+    """The name of a camera once its focal length is adjusted."""
+    return f"{camera}_adjusted"
 
 
 def _described(camera: Camera, lens: Camera) -> dict[str, Any]:

@@ -184,6 +184,13 @@ def _of_agreement(found: Agreement, unit: str) -> list[str]:
             f"held by {held}: pictures alone prefer turns that are too small where baselines are small, and bend the "
             f"map. Here turns between frames are {adjusted.turns:.3g} of those given."
         )
+        if adjusted.focal:
+            parts.append(
+                "It names cameras whose focal length was adjusted with the poses, held by the given one to 2 %. They "
+                "come into use with the poses:"
+            )
+            header = ["camera", "adjusted focal length over the given"]
+            parts.append(_table(tuple(header), [(name, f"{scale:.4f}") for name, scale in adjusted.focal.items()]))
     return parts
 
 

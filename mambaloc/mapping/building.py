@@ -141,7 +141,7 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
         settings.least_inliers,
         scene,
         _digests(frames, tracks),
-        structure.lens,
+        structure.lenses[0],
         np.zeros((0, 6)) if tracks else drift,
         nugget,
     )

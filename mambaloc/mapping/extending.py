@@ -17,7 +17,6 @@ from mambaloc.mapping.tracks import agreeing
 from mambaloc.mapping.triangulation import Observations
 from mambaloc.runtime.maps import CameraPose, MapLocaliser
 from mambaloc.runtime.maps.features import Features
-from mambaloc.runtime.maps.lens import Lens
 from mambaloc.runtime.maps.viewpoints import spread_m
 
 Floats = NDArray[np.floating[Any]]
@@ -76,10 +75,10 @@ def extend(
         if near_px != _NEAR_PX[-1] and len(poses) > 1:
             both, tracks = _joined(known, seen, len(sparse_map))
             every_m = np.concatenate((sparse_map.points_m, points_m))[tracks]
-            start, is_fixed = Bundle(poses, every_m, Lens()), tracks < len(sparse_map)
+            start, is_fixed = Bundle(poses, every_m), tracks < len(sparse_map)
             sigma = _SIGMA * near_px * unit_px / focal_px
             prior = poses if given is None else given
-            poses = adjust(start, prior, drift, both, sigma, False, is_fixed=is_fixed).world_from_cam
+            poses = adjust(start, prior, drift, both, sigma, is_fixed=is_fixed).world_from_cam
     descriptors = mean_descriptors(features, len(points_m), seen, keypoint)
     kept = most_useful(seen, len(points_m), most_points, sparse_map.size[0] / focal_px)
     old, new = (views_of(each, count, len(poses)) for each, count in ((known, len(sparse_map)), (seen, len(points_m))))

@@ -47,4 +47,4 @@ def described(tracks: Tracks, features: Sequence[Features], world_from_cam: Floa
     rows, track = np.unique(tracks.point[used], return_inverse=True)
     seen = Observations(tracks.frame[used], track, tracks.rays[used], np.full(len(used), near))
     descriptors = mean_descriptors(features, len(rows), seen, keypoint[used])
-    return Structure(world_from_cam, Lens(), tracks.points_m[rows], descriptors, seen, 1.0)
+    return Structure(world_from_cam, (Lens(),), tracks.points_m[rows], descriptors, seen, 1.0)

@@ -30,18 +30,19 @@ DRIFT_RAD = np.radians(1.0)
 
 @dataclass(frozen=True)
 class Structure:
-    """Points, where frames see them, and the poses and lens that both agree with.
+    """Points, where frames see them, and the poses and lenses that both agree with.
 
     Shape:
         ``world_from_cam`` (N, 4, 4); ``points_m`` (P, 3); ``descriptors`` (P, 128), means of unit length.
 
     Args:
+        lenses: one a camera; the first alone, as claimed, where none was fitted.
         seen: where frames see the points, which are its tracks.
         agreeing: share of the matches that agree with the given poses.
     """
 
     world_from_cam: Floats
-    lens: Lens
+    lenses: tuple[Lens, ...]
     points_m: Floats
     descriptors: NDArray[np.float32]
     seen: Observations
@@ -60,8 +61,9 @@ def recover_structure(
     matches: Sequence[Indices],
     rng: np.random.Generator,
     depth_m: Sequence[Floats] | None = None,
+    camera: Indices | None = None,
 ) -> Structure:
-    """Triangulate with the given poses, adjust poses and lens, and triangulate again.
+    """Triangulate with the given poses, adjust poses and lenses, and triangulate again.
 
     Args:
         features: of each frame.
@@ -70,11 +72,15 @@ def recover_structure(
         matches: rows of keypoints of both frames of each pair.
         rng: draws views.
         depth_m: of each frame's keypoints along the optical axis, NaN where it was not measured.
+        camera: which each frame was taken with, from 0 on, (N,); a lens is fitted for each. Otherwise one is fitted
+            where all intrinsics are equal, and none where they are not.
     """
     unit_px = features[0].size[0] / 160
     focal_px = features[0].intrinsics[0, 0]
-    is_one_camera = all(np.allclose(each.intrinsics, features[0].intrinsics) for each in features)
-    poses, lens, share = given, Lens(), np.nan
+    if camera is None and all(np.allclose(each.intrinsics, features[0].intrinsics) for each in features):
+        camera = np.zeros(len(features), np.int64)
+    lenses = (Lens(),) if camera is None else (Lens(),) * (int(camera.max()) + 1)
+    poses, share = given, np.nan
     drift = (DRIFT * spread_m(given), DRIFT_RAD)
     for near_px in _NEAR_PX:
         is_first = near_px == _NEAR_PX[0]
@@ -84,15 +90,16 @@ def recover_structure(
             break
         sigma = _SIGMA_PX * unit_px / focal_px
         measured = None if depth_m is None else np.concatenate(depth_m)[keypoint]
-        bundle = adjust(Bundle(poses, points, Lens()), given, drift, seen, sigma, is_first and is_one_camera, measured)
+        start = Bundle(poses, points, lenses) if is_first else Bundle(poses, points)
+        bundle = adjust(start, given, drift, seen, sigma, camera if is_first else None, measured)
         poses = bundle.world_from_cam
         shift_m, turn_rad = np.sqrt((moves(given, poses).reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
         drift = (min(drift[0], 2 * shift_m), min(drift[1], 2 * turn_rad))
-        if is_first:
-            lens = bundle.lens
-            features = [lens.straighten(each) for each in features]
+        if is_first and camera is not None:
+            lenses = bundle.lenses
+            features = [lenses[number].straighten(each) for number, each in zip(camera, features, strict=True)]
     points, seen, keypoint, _ = triangulated(features, poses, pairs, matches, _NEAR_PX[-1] * unit_px, rng)
-    return Structure(poses, lens, points, mean_descriptors(features, len(points), seen, keypoint), seen, share)
+    return Structure(poses, lenses, points, mean_descriptors(features, len(points), seen, keypoint), seen, share)
 
 
 def mean_descriptors(

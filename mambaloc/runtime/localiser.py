@@ -15,7 +15,6 @@ from mambaloc.images import Image, as_rgb, read_image
 from mambaloc.runtime.contract import MODEL_FILES, Contract
 from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
-from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY
 from mambaloc.runtime.network import Network
 from mambaloc.runtime.sources import SourceFrame, frames_of
 
@@ -122,7 +121,7 @@ class Localiser:
 def _warn_of_focal_length(found: MapLocalisation) -> None:
     """Where a pose would be accepted but for that; in steps of 5 %, so that a film's frames say it once."""
     scale = found.focal_scale
-    if scale is None or found.evidence is None or found.evidence.probability < LEAST_PROBABILITY:
+    if scale is None or found.evidence is None or not found.evidence.is_enough:
         return
     off = f"about {5 * max(1, round(20 * abs(scale - 1)))} % too {'short' if scale > 1 else 'long'}"
     warnings.warn(

@@ -5,7 +5,7 @@ import { pathToFileURL } from "node:url";
 
 const load = (name) => import(pathToFileURL(join(process.argv[2], name)));
 const { focalScale, ransacPose, refinePose } = await load("absolute_pose.js");
-const { LEAST_PROBABILITY, isAnotherFocalLength, probabilityOf } = await load("acceptance.js");
+const { LEAST_PROBABILITY, MOST_DEVIATION, isAnotherFocalLength, probabilityOf } = await load("acceptance.js");
 const { posesOfThree } = await load("three_points.js");
 const { three, many, evidence } = JSON.parse(readFileSync(0, "utf8"));
 const found = {
@@ -19,5 +19,6 @@ const found = {
   }),
   probabilities: evidence.map((each) => probabilityOf(...each)),
   least: LEAST_PROBABILITY,
+  most: MOST_DEVIATION,
 };
 console.log(JSON.stringify(found));

@@ -118,6 +118,7 @@ def test_a_map_is_described_with_poses_that_a_port_must_find(mapped, map_of_den,
     assert (described["points"], described["key_frames"]) == (len(sparse_map), len(sparse_map.key_poses))
     assert (described["scene"], described["size"], described["keypoints"]) == ("den", [160, 120], "sift")
     assert described["accepted"]["least_probability"] == acceptance.LEAST_PROBABILITY
+    assert described["accepted"]["most_deviation"] == acceptance.MOST_DEVIATION
     assert described["accepted"]["calibrated_on"]["frames"] > 100
     assert described["allowed"] == {"position_mm": 10, "rotation_deg": 0.3}
     frames = data.frames("test")
@@ -218,7 +219,7 @@ def test_native_apps_decide_as_python_does():
             maps_localiser._PRIOR_WINDOW,
             maps_localiser._SHARED,
         ),
-        *(acceptance._CELLS, acceptance.LEAST_PROBABILITY, localisation._UNSTATED),
+        *(acceptance._CELLS, acceptance.LEAST_PROBABILITY, acceptance.MOST_DEVIATION, localisation._UNSTATED),
         *map(abs, (acceptance._CONSTANT, acceptance._PER_CELLS, acceptance._PER_DEVIATION, acceptance._PER_TURN)),
         *(acceptance._LEAST_DEVIATION, acceptance._LEAST_TURN_DEG),
         *(acceptance._FOCAL_OFF, acceptance._FOCAL_DEVIATIONS),

@@ -16,6 +16,7 @@ import pytest
 from captures import FOCAL_PX, SIZE
 from scipy.spatial.transform import Rotation
 
+from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.data.datasets.capture import COLUMNS, read_rows, read_split
 from mambaloc.data.frames import BadFrames
 from mambaloc.data.tracks import Tracks, read_tracks
@@ -219,6 +220,21 @@ def test_adjusted_poses_are_written_beside_the_given(rendered, tmp_path):
     report = (tmp_path / "scene/report.md").read_text()
     assert "nothing uses unless it is renamed" in report
     assert "pictures alone prefer turns that are too small" in report
+    # Cameras come into use with the poses, once the file is renamed, and not before.
+    (scale,) = said["adjusted poses"]["focal_over_given"].values()
+    given_px = focal_px(tmp_path / "scene")
+    (tmp_path / "scene/frames_adjusted.csv").rename(tmp_path / "scene/frames.csv")
+    assert 0.97 < scale < 1.03
+    assert scale != 1
+    given, adjusted = told(tmp_path / "scene")["cameras"].values()
+    assert given_px == given["focal_px"][0]
+    assert adjusted["centre_px"] == given["centre_px"]
+    assert focal_px(tmp_path / "scene") == pytest.approx(scale * given_px, rel=1e-4)
+
+
+def focal_px(scene):
+    """Of the first training frame."""
+    return frame_intrinsics("capture", scene, read_split(scene, "train", BadFrames()))[0, 0, 0]
 
 
 # --- what captures really look like ----------------------------------------------------------------------------------

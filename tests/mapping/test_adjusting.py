@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.mapping.adjusting import Bundle, adjust
 from mambaloc.mapping.triangulation import Observations
-from mambaloc.runtime.maps.lens import Lens
 
 FRAMES, SIGMA = 5, 0.01
 DRIFT = (0.01, np.radians(0.5))
@@ -27,7 +26,7 @@ class Scene:
     depth: np.ndarray
 
     def adjusted(self, given, points, drift=DRIFT, depth=None):
-        return adjust(Bundle(given, points, Lens()), given, drift, self.seen, SIGMA, False, depth)
+        return adjust(Bundle(given, points), given, drift, self.seen, SIGMA, depth_m=depth)
 
 
 def film(frames, count, noise=0.0):
@@ -139,10 +138,18 @@ def test_a_lens_that_fits_is_found():
     given, drift, sigma, rng = poses.copy(), (0.02, 0.01), 0.004, np.random.default_rng(1)
     given[:, :3, 3] += rng.normal(0, drift[0], (12, 3))
     given[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, drift[1], (12, 3))).as_matrix() @ poses[:, :3, :3]
-    found = adjust(Bundle(given, points + 0.05, Lens()), given, drift, seen, sigma, is_lens_free=True)
-    assert found.lens.numbers == pytest.approx((0.97, -0.05), abs=0.01)
-    off = rays(found.world_from_cam, found.points_m, *found.lens.numbers) - seen.rays
+    found = adjust(Bundle(given, points + 0.05), given, drift, seen, sigma, np.zeros(12, np.int64))
+    assert found.lenses[0].numbers == pytest.approx((0.97, -0.05), abs=0.01)
+    off = rays(found.world_from_cam, found.points_m, *found.lenses[0].numbers) - seen.rays
     assert np.sqrt((off**2).mean()) < 0.2 * sigma
     assert np.sqrt(((rays(given, points, 1, 0) - seen.rays) ** 2).mean()) > 4 * sigma
-    fixed = adjust(Bundle(given, points, Lens()), given, drift, seen, sigma, is_lens_free=False)
-    assert fixed.lens.numbers == pytest.approx((1, 0), abs=1e-6)
+    # The same observations as if of two cameras, of which the second has the pinhole that it claims.
+    second = frame >= 6
+    both = np.where(second[:, None], rays(poses, points, 1, 0), seen.rays)
+    cameras, lenses = (np.arange(12) >= 6).astype(np.int64), 2 * Bundle(given, points).lenses
+    start = Bundle(given, points + 0.05, lenses)
+    found = adjust(start, given, drift, replace(seen, rays=both), sigma, cameras)
+    assert found.lenses[0].numbers == pytest.approx((0.97, -0.05), abs=0.01)
+    assert found.lenses[1].numbers == pytest.approx((1, 0), abs=0.01)
+    fixed = adjust(Bundle(given, points), given, drift, seen, sigma)
+    assert fixed.lenses[0].numbers == pytest.approx((1, 0), abs=1e-6)

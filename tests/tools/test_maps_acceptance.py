@@ -10,6 +10,7 @@ from mambaloc.mapping import PosedFrames
 from mambaloc.mapping.building import MapSettings, build_map
 from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render
 from mambaloc.runtime.maps import MapLocaliser
+from mambaloc.runtime.maps.acceptance import MOST_DEVIATION
 
 FIELDS = maps_acceptance._FIELDS
 
@@ -37,7 +38,11 @@ def test_coefficients_and_shares_of_drawn_evidence(tmp_path):
     np.testing.assert_allclose(fitted, coefficients, atol=0.25)
     assert lines[1].startswith("20000 frames, 20000 pictures")
     known = np.log(np.column_stack((rows[:, 4] + 0.5, rows[:, 5], rows[:, 6] + 0.1)))
-    accepted = coefficients[0] + known @ coefficients[1:] > np.log(0.95 / 0.05)
+    is_likely = coefficients[0] + known @ coefficients[1:] > np.log(0.95 / 0.05)
+    accepted = is_likely & (rows[:, 5] <= MOST_DEVIATION)
+    assert accepted.sum() < 0.8 * is_likely.sum()
+    (without_bound,) = [line for line in lines if line.startswith("deviations to inf")]
+    assert int(without_bound.split("accepted")[1].split()[0]) == pytest.approx(is_likely.sum(), rel=0.05)
     (all_of,) = [line for line in lines if line.startswith("fitted to others, 0.95")]
     assert int(all_of.split("accepted")[1].split()[0]) == pytest.approx(accepted.sum(), rel=0.05)
     wrong = float(all_of.split(", ")[-1].split("%")[0])

@@ -23,7 +23,7 @@ from mambaloc.mapping.building import MapSettings
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.maps import CameraPose, MapLocalisation, MapLocaliser
-from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, Evidence
+from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, MOST_DEVIATION, Evidence
 from mambaloc.runtime.maps.features import rescaled_intrinsics
 from mambaloc.runtime.maps.viewpoints import spread_m
 from mambaloc.runtime.rotations import matrix_from_quaternion
@@ -36,7 +36,8 @@ _FIELDS = (
     "fold", "frame", "picture", "disturbance", "cells", "deviation", "turn_deg", "inliers", "accepted", "focal",
     "off_m", "off_deg", "pose_chi2", "position_chi2",
 )  # fmt: skip
-_THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99)
+_THRESHOLDS = (0.85, 0.9, 0.92, 0.95, 0.97, 0.98, 0.99)
+_BOUNDS = (0.06, 0.09, 0.12, 0.16, 0.24, np.inf)
 _MOST_WRONG = 0.005
 _NAMES = [*DISTURBANCES, _RANDOM, "focal length x 0.9", "focal length x 1.1"]
 
@@ -147,9 +148,13 @@ def calibrate(folders: Sequence[Path]) -> str:
         f"{len(np.unique(pictures[:, :2], axis=0))} frames, {len(np.unique(pictures[is_asked], axis=0))} pictures with "
         f"a pose, {int(is_asked.sum())} poses",
     ]
-    can = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
+    has_matches = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
+    can = has_matches & (of["deviation"] <= MOST_DEVIATION)
     probability = _left_out(known, is_wrong, says, is_asked, group)
     chosen = is_asked & _likeliest(pictures, probability)
+    is_likely = has_matches & (probability >= LEAST_PROBABILITY)
+    for most in _BOUNDS:
+        lines.append(_shares(f"deviations to {most:.2f}", chosen, is_likely & (of["deviation"] <= most), is_wrong))
     lines += _thresholds(chosen, np.where(can, probability, 0), is_wrong)
     probability = np.array([each.probability for each in evidence])
     is_final, accepted = _likeliest(pictures, probability), can & (probability >= LEAST_PROBABILITY)

@@ -1,7 +1,7 @@
 /** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localiser.py` finds it. No DOM. */
 
 import { focalScale, project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
-import { LEAST_PROBABILITY, isAnotherFocalLength, occupiedCells, probabilityOf } from "./acceptance.js";
+import { LEAST_PROBABILITY, MOST_DEVIATION, isAnotherFocalLength, occupiedCells, probabilityOf } from "./acceptance.js";
 import { Drift } from "./drift.js";
 import { matrixOf, median, quaternionOf } from "./geometry.js";
 import { Matcher, matchNearby } from "./matching.js";
@@ -96,14 +96,17 @@ export class MapLocaliser {
     const inliers = off.filter((each) => each <= near).length;
     const focal = focalScale(pose, seen_m, rays, finest);
     const focalOff = isAnotherFocalLength(focal) ? focal.scale : null;
-    const probability = focalOff === null ? this.#probability(features, start, pose, matches, shown, finest) : 0;
+    const evidence = this.#evidence(features, start, pose, matches, shown, finest);
+    const deviation = Math.max(evidence.deviation, this.#deviation(covariance));
+    const probability = focalOff === null ? probabilityOf(evidence.cells, deviation, evidence.turn_deg) : 0;
+    const isEnough = probability >= LEAST_PROBABILITY && deviation <= MOST_DEVIATION;
     const carried = this.#drift?.toGiven(pose);
     const { position_m, rotation } = carried?.pose ?? pose;
     return {
       position_m,
       quaternion_wxyz: quaternionOf(rotation),
       inliers,
-      isAccepted: probability >= LEAST_PROBABILITY && inliers >= this.#map.about.least_inliers,
+      isAccepted: isEnough && inliers >= this.#map.about.least_inliers,
       covariance: covariance?.map((row, i) => row.map((value, j) => SHARED * value + (carried?.unsure[i][j] ?? 0))),
       probability,
       focalScale: focalOff,
@@ -111,17 +114,22 @@ export class MapLocaliser {
     };
   }
 
-  /** That a pose is right, by its distinctive matches. */
-  #probability(features, start, pose, matches, shown, scale) {
+  /** What distinctive matches say of a pose. */
+  #evidence(features, start, pose, matches, shown, scale) {
     const rows = this.#matcher.distinctive(features, matches);
     let deviation = Infinity;
     if (rows.length >= 4) {
       const [keypoints, points] = [matches.keypoints, matches.points].map((all) => rows.map((i) => all[i]));
       const { covariance } = refinePose(pose, ...this.#matched(features, { keypoints, points }), scale);
-      if (covariance) deviation = Math.sqrt(largestEigenvalue(covariance)) / this.#unit_m;
+      deviation = this.#deviation(covariance);
     }
     const cells = occupiedCells(rows.map((i) => shown[i]).filter(({ off }) => off <= 1));
-    return probabilityOf(cells, deviation, turnBetween(start.rotation, pose.rotation));
+    return { cells, deviation, turn_deg: turnBetween(start.rotation, pose.rotation) };
+  }
+
+  /** Of the position in the worst direction, over the spread of the key frames. */
+  #deviation(covariance) {
+    return covariance ? Math.sqrt(largestEigenvalue(covariance)) / this.#unit_m : Infinity;
   }
 
   /** Match again what a pose projects within a radius of a keypoint. */

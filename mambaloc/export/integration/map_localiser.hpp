@@ -42,7 +42,7 @@ struct MapLocalisation {
   CameraPose pose;
   int inliers = 0;
   bool accepted = false;
-  double probability = 0;  // that it is within 0.2 m and 5 degrees; it is accepted from 0.95 on
+  double probability = 0;  // that it is within 0.2 m and 5 degrees; accepted from 0.95 on, where the position is sure, too
   double focal_scale = 1;  // times the given focal length, where matches contradict that; the probability is 0 then
   // Position in metres, then rotation in radians about the world's axes: the order and frame of ROS.
   cv::Matx66d covariance;
@@ -225,6 +225,7 @@ class MapLocaliser {
     const auto [focal, focal_deviation] = focal_scale(pose, points, rays, finest);
     const bool is_another = std::abs(std::log(focal)) > std::max(0.03, 3.0 * focal_deviation);
     if (is_another) answer.focal_scale = focal;
+    double unsure_by = deviation(answer.covariance) / unit_m_;  // by all matches, or by distinctive ones where that is more
     if (!is_another) {
       std::vector<cv::Vec3d> theirs;
       std::vector<cv::Vec2d> where;
@@ -237,15 +238,16 @@ class MapLocaliser {
       }
       if (theirs.size() >= 4) {
         CameraPose again = pose;
-        const double share = deviation(refine(again, theirs, where, finest)) / unit_m_;
+        const double alone = deviation(refine(again, theirs, where, finest)) / unit_m_;
+        unsure_by = std::isfinite(alone) ? std::max(unsure_by, alone) : alone;
         cv::Vec3d turn;
         cv::Rodrigues(start.rotation.t() * pose.rotation, turn);
-        const double evidence = -4.9 + 3.48 * std::log(double(cells.size()) + 0.5) - 0.34 * std::log(std::max(share, 1e-3)) -
+        const double evidence = -4.9 + 3.48 * std::log(double(cells.size()) + 0.5) - 0.34 * std::log(std::max(unsure_by, 1e-3)) -
                                 1.01 * std::log(cv::norm(turn) * 180 / CV_PI + 0.1);
-        answer.probability = std::isfinite(share) ? 1 / (1 + std::exp(-evidence)) : 0;
+        answer.probability = std::isfinite(unsure_by) ? 1 / (1 + std::exp(-evidence)) : 0;
       }
     }
-    answer.accepted = answer.probability >= 0.95 && answer.inliers >= least_inliers_;
+    answer.accepted = answer.probability >= 0.95 && unsure_by <= 0.12 && answer.inliers >= least_inliers_;
     const auto [given, unsure] = carried(pose, 1);
     answer.pose = given;
     answer.covariance = 1.25 * answer.covariance + unsure;  // neighbouring matches share errors

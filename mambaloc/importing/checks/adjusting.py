@@ -1,8 +1,9 @@
-"""Poses of a capture adjusted to its pictures by bundle adjustment: an offer beside those given, not a replacement."""
+"""Poses and focal lengths of a capture adjusted to its pictures: an offer beside those given, not a replacement."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,7 @@ from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.structure import recover_structure
 from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps.features import Features
+from mambaloc.runtime.maps.lens import Lens
 from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.floating[Any]]
@@ -27,6 +29,7 @@ Indices = NDArray[np.int64]
 
 _MOST_FRAMES = 100  # the others move with their neighbours
 _LEAST_POINTS = 50
+_LEAST_FRAMES = 8  # of each camera, so that its lens is fitted
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,8 @@ class Adjusted:
         turned_deg: how far cameras turned, median.
         turns: length of the turns between neighbours over that before.
         with_depth: whether depth held the scale and the turns.
+        focal: the fitted focal length over that given, by camera; empty where the capture gives none, or where a camera
+            took too few of the frames.
     """
 
     world_from_cam: Floats
@@ -50,10 +55,11 @@ class Adjusted:
     turned_deg: float
     turns: float
     with_depth: bool
+    focal: Mapping[str, float]
 
 
 def adjust_poses(capture: Capture) -> Adjusted:
-    """Adjust poses to what the pictures show, with the given ones and depth, where there is some, as priors.
+    """Adjust poses and lenses to what the pictures show; the given ones, and depth where there is some, are priors.
 
     Args:
         capture: its images are those of pinholes.
@@ -77,7 +83,8 @@ def adjust_poses(capture: Capture) -> Adjusted:
     depth = None
     if capture.depth is not None:
         depth = [_depth(capture.depth, row, each) for row, each in zip(rows.tolist(), features, strict=True)]
-    structure = recover_structure(features, given, pairs, matches, np.random.default_rng(0), depth)
+    names, camera = _cameras(capture, rows)
+    structure = recover_structure(features, given, pairs, matches, np.random.default_rng(0), depth, camera)
     if len(structure.points_m) < _LEAST_POINTS:
         raise InputError(
             f"--adjust-poses: the pictures give {len(structure.points_m)} points. Film more texture, or leave it out."
@@ -92,7 +99,28 @@ def adjust_poses(capture: Capture) -> Adjusted:
         float(np.median(rotation_error_deg(*quaternion))),
         _turns(after) / max(_turns(given), 1e-12),
         depth is not None,
+        {} if camera is None else _focal(names, structure.lenses, features, camera),
     )
+
+
+def _cameras(capture: Capture, rows: Indices) -> tuple[list[str], Indices | None]:
+    """Names of the frames' cameras, and which each frame was taken with; None where no lens is fitted for each."""
+    if capture.camera_of is None:
+        return [], None
+    names, camera = np.unique([capture.camera_of[row] for row in rows], return_inverse=True)
+    return names.tolist(), camera if np.bincount(camera).min() >= _LEAST_FRAMES else None
+
+
+def _focal(
+    names: Sequence[str], lenses: Sequence[Lens], features: Sequence[Features], camera: Indices
+) -> dict[str, float]:
+    """The focal length of the pinhole that is nearest to each lens where pictures have keypoints, over that given."""
+    found = {}
+    for number, (name, lens) in enumerate(zip(names, lenses, strict=True)):
+        rays = [each.rays for each, own in zip(features, camera == number, strict=True) if own]
+        ideal = lens.undistort(np.concatenate(rays))
+        found[name] = float((lens.distort(ideal) * ideal).sum() / max((ideal**2).sum(), 1e-12))
+    return found
 
 
 def _depth(depth: Depth, row: int, features: Features) -> Floats:

@@ -204,11 +204,14 @@ def _of_adjusted(found: Adjusted) -> Finding:
     figures = {
         "frames": found.frames, "points": found.points, "turns_over_given": round(found.turns, 4),
         "moved": round(found.moved, 6), "turned_deg": round(found.turned_deg, 3), "with_depth": found.with_depth,
+        "focal_over_given": {name: round(scale, 4) for name, scale in found.focal.items()},
     }  # fmt: skip
     said = (
         f"{found.frames} frames and {found.points} points adjusted: camera centres moved by {found.moved:.3g}, cameras "
         f"turned by {found.turned_deg:.2g}° (medians); turns between frames are {found.turns:.3g} of those given"
     )
+    if found.focal:
+        said += "; focal length " + ", ".join(f"{scale:.4f} ({name})" for name, scale in found.focal.items())
     return Finding("adjusted poses", said, figures=figures)
 
 

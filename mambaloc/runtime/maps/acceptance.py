@@ -2,6 +2,7 @@
 
 A search around a wrong pose finds matches, too: one of the few points near a keypoint is the most similar, and the pose
 follows those that agree by chance. Hardly any of these is distinctive: the most similar of all points in view.
+All matches of a blurred picture may be right and yet fix its pose to decimetres only: precision has its own bound.
 """
 
 from __future__ import annotations
@@ -12,14 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-RULE = 2
+RULE = 3
 """Version of what follows."""
 LEAST_PROBABILITY = 0.95
 """The least probability of an accepted pose: of such poses of held-out training frames at most 0.5 % were wrong."""
-CALIBRATION = {"frames": 272, "pictures": 3941, "accepted": 0.666, "accepted_and_wrong": 0.0034}
+MOST_DEVIATION = 0.12
+"""The largest :attr:`Evidence.deviation` of an accepted pose: 8 cm in a room where key frames spread over 0.66 m."""
+CALIBRATION = {"frames": 224, "pictures": 3222, "accepted": 0.677, "accepted_and_wrong": 0.0009}
 """How that was measured: frames held out of training, of a real room and a rendered one, each in two maps; pictures of
 them, disturbed, that gave a pose; the share that is accepted, with 20 inliers, by coefficients that were fitted to
-other sequences; and of these the wrong ones' (95 %: 0.18 to 0.65 %)."""
+other sequences; and of these the wrong ones' (95 %: 0.03 to 0.33 %)."""
 
 _CELLS = 4  # a side of the grid
 _CONSTANT, _PER_CELLS, _PER_DEVIATION, _PER_TURN = -4.9, 3.48, -0.34, -1.01
@@ -33,8 +36,8 @@ class Evidence:
 
     Args:
         cells: how many cells of a grid of 4 x 4 over the picture have a distinctive match that agrees with the pose.
-        deviation: of the position as distinctive matches alone fix it, one standard deviation in the worst direction,
-            over the spread of the key frames.
+        deviation: of the position, one standard deviation in the worst direction, over the spread of the key frames:
+            as all matches fix it or as distinctive ones alone do, whichever is larger.
         turn_deg: from RANSAC's pose to the refined one.
     """
 
@@ -49,6 +52,11 @@ class Evidence:
             return 0.0
         cells, deviation, turn = self.logarithms()
         return 1 / (1 + math.exp(-(_CONSTANT + _PER_CELLS * cells + _PER_DEVIATION * deviation + _PER_TURN * turn)))
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the pose is accepted, if it has enough inliers and the focal length fits."""
+        return self.probability >= LEAST_PROBABILITY and self.deviation <= MOST_DEVIATION
 
     def logarithms(self) -> tuple[float, float, float]:
         """What the regression is linear in."""

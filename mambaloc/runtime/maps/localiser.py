@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb
 from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, pose_covariance, ransac_pose, refine_pose
-from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, Evidence, is_another_focal_length, occupied_cells
+from mambaloc.runtime.maps.acceptance import Evidence, is_another_focal_length, occupied_cells
 from mambaloc.runtime.maps.drift import Drift
 from mambaloc.runtime.maps.features import (
     Features,
@@ -53,8 +53,8 @@ class MapLocalisation:
         position_m: in the map's frame.
         quaternion: of the camera's rotation in the map's frame.
         inliers: matches that agree with the pose.
-        is_accepted: whether its probability reaches :data:`~mambaloc.runtime.maps.acceptance.LEAST_PROBABILITY` and it
-            has as many inliers as the map requires.
+        is_accepted: whether its evidence is enough, matches ask for no other focal length, and it has as many inliers
+            as the map requires.
         covariance: of the position in metres, then of the rotation in radians about the fixed axes of the world: the
             order and frame of ROS's PoseWithCovariance. It says how well the matches fix the pose; errors that the
             map's own poses share are not in it.
@@ -161,7 +161,8 @@ class MapLocaliser:
             off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
             scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
         is_inlier = off <= near
-        evidence = self._evidence(features, matches, is_inlier, start, pose, finest)
+        covariance = pose_covariance(pose, seen_m, rays, finest)
+        evidence = self._evidence(features, matches, is_inlier, start, pose, finest, _deviation_m(covariance))
         focal = focal_scale(pose, seen_m, rays, finest)
         focal_off = focal[0] if is_another_focal_length(*focal) else None
         probability = evidence.probability if focal_off is None else 0.0
@@ -170,8 +171,8 @@ class MapLocaliser:
             given.position_m,
             quaternion_from_matrix(given.rotation),
             int(is_inlier.sum()),
-            bool(probability >= LEAST_PROBABILITY and is_inlier.sum() >= self.map.least_inliers),
-            _SHARED * pose_covariance(pose, seen_m, rays, finest) + unsure,
+            bool(focal_off is None and evidence.is_enough and is_inlier.sum() >= self.map.least_inliers),
+            _SHARED * covariance + unsure,
             probability,
             focal_off,
             evidence,
@@ -185,14 +186,15 @@ class MapLocaliser:
         start: CameraPose,
         pose: CameraPose,
         scale: float,
+        deviation_m: float,
     ) -> Evidence:
-        """What distinctive matches say of a pose that :meth:`_settled` refined from ``start``, at a ``scale``."""
+        """What speaks for a pose that :meth:`_settled` refined from ``start`` at a ``scale``; the deviation is its."""
         points, keypoints = matches.points[matches.is_distinctive], matches.keypoints[matches.is_distinctive]
-        deviation = np.inf
+        alone_m = np.inf
         if len(points) >= 4:
             seen_m, rays = self._points_m[points], features.rays[keypoints]
-            alone = refine_pose(pose, seen_m, rays, scale)
-            deviation = _deviation_m(pose_covariance(alone, seen_m, rays, scale)) / self._unit_m
+            alone_m = _deviation_m(pose_covariance(refine_pose(pose, seen_m, rays, scale), seen_m, rays, scale))
+        deviation = float(np.maximum(alone_m, deviation_m)) / self._unit_m  # NaN where either is
         pixels = features.pixels[matches.keypoints[matches.is_distinctive & is_inlier]]
         turn_deg = np.degrees(np.linalg.norm(cv2.Rodrigues(start.rotation.T @ pose.rotation)[0]))
         return Evidence(occupied_cells(pixels, features.size), deviation, float(turn_deg))

@@ -268,6 +268,23 @@ def test_exact_poses_hardly_move(filmed):
     assert found.with_depth
 
 
+@pytest.mark.parametrize("with_depth", [True, False])
+def test_each_camera_has_a_focal_length_of_its_own(filmed, with_depth):
+    """Every second frame's camera claims a focal length that is 3 % too long.
+
+    Both together are less sure than their ratio: they trade off against turns.
+    """
+    camera = filmed.cameras["c"]
+    longer = replace(camera, focal_px=tuple(1.03 * each for each in camera.focal_px))
+    two = replace(filmed, cameras={"c": camera, "d": longer}, camera_of=("c", "d") * 20)
+    found = adjust_poses(two if with_depth else replace(two, depth=None))
+    print(found.focal, found.moved, found.turned_deg, found.turns)
+    assert found.focal["d"] / found.focal["c"] == pytest.approx(1 / 1.03, abs=0.005)
+    assert found.focal["c"] == pytest.approx(1, abs=0.012)
+    few = adjust_poses(replace(two, camera_of=("c",) * 36 + ("d",) * 4, depth=None))
+    assert few.focal == {}
+
+
 def test_frames_between_move_with_their_neighbours(filmed, monkeypatch):
     """Every second frame is adjusted; the whole path was turned aside by a drift, which is taken back from all."""
     monkeypatch.setattr("mambaloc.importing.checks.adjusting._MOST_FRAMES", 20)

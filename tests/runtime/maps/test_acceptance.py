@@ -23,6 +23,15 @@ def test_more_evidence_makes_a_pose_likelier():
     assert logit(Evidence(16, 0.003, 0.2).probability) > logit(acceptance.LEAST_PROBABILITY) > logit(base) - 4
 
 
+def test_a_likely_pose_that_is_not_precise_is_not_enough():
+    most = acceptance.MOST_DEVIATION
+    assert Evidence(16, most, 0.1).is_enough
+    assert not Evidence(16, 1.01 * most, 0.1).is_enough
+    assert Evidence(16, 1.01 * most, 0.1).probability > acceptance.LEAST_PROBABILITY
+    assert not Evidence(2, 0.01, 5.0).is_enough
+    assert not Evidence(16, np.nan, 0.1).is_enough
+
+
 def test_too_few_distinctive_matches_are_no_evidence():
     assert Evidence(3, np.inf, 0.0).probability == 0
     assert 0 < Evidence(0, 5.0, 180.0).probability < 0.05
