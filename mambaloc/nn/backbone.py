@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from mambaloc.errors import InputError
-from mambaloc.nn.pooling import pool_before_relu
 from mambaloc.nn.winograd import use_winograd
 
 
@@ -137,8 +136,6 @@ class Backbone(ImageBackbone):
         config = body.model.pretrained_cfg
         file = None if weights == "timm" else weights
         super().__init__(name, body, file, pixel_mean or config["mean"], pixel_std or config["std"])
-        if strides[0] > 2:  # a ResNet's map at stride 2 is what is pooled
-            pool_before_relu(self.model)
         self.strides = strides
         self.channels: list[int] = self.body.feature_info.channels()
 
@@ -187,7 +184,6 @@ class PooledBackbone(ImageBackbone):
         config = body.pretrained_cfg
         file = None if weights == "timm" else weights
         super().__init__(name, body, file, pixel_mean or config["mean"], pixel_std or config["std"])
-        pool_before_relu(self.model)
         self.width: int = body.head_hidden_size
 
     def forward(self, image: Tensor) -> Tensor:
