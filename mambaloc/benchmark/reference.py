@@ -234,7 +234,10 @@ class ReferenceLoop:
         self.network = published_form(system)(system).to(device)
         self.loss = deepcopy(system.loss).to(device)
         parameters = [*self.network.parameters(), *self.loss.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=system.lr, eps=1e-10, weight_decay=system.weight_decay)
+        betas = (0.9, system.beta2)
+        self.optimizer = torch.optim.Adam(
+            parameters, lr=system.lr, betas=betas, eps=1e-10, weight_decay=system.weight_decay
+        )
 
     def train(self, steps: int, clock: StepClock) -> list[float]:
         """Train so many steps; the loss of each as a number."""

@@ -36,7 +36,7 @@ class Setting:
         """Put what an overlay says over this; it has nothing but these three sections to say.
 
         Raises:
-            InputError: for a file that is no overlay.
+            InputError: for a file that is not an overlay.
         """
         said = read_yaml(path, "see recipes/overlays/", "give an overlay, as recipes/overlays/ holds them")
         if not isinstance(said, dict) or not set(said) & {"model", "data", "trainer"}:
@@ -71,7 +71,7 @@ class Setting:
 def _section(path: Path, said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     section = said.get(name) or {}
     if not isinstance(section, dict) or not all(isinstance(key, str) for key in section):
-        raise InputError(f"{path}: {name} is no mapping of names; indent what belongs to it")
+        raise InputError(f"{path}: {name} is not a mapping. Indent its options below it.")
     return section
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -189,8 +190,8 @@ def _of_agreement(found: Agreement, unit: str) -> list[str]:
                 "It names cameras whose focal length was adjusted with the poses, held by the given one to 2 %. They "
                 "come into use with the poses:"
             )
-            header = ["camera", "adjusted focal length over the given"]
-            parts.append(_table(tuple(header), [(name, f"{scale:.4f}") for name, scale in adjusted.focal.items()]))
+            scales = [(name, f"{scale:.4f}") for name, scale in adjusted.focal.items()]
+            parts.append(_table(("camera", "adjusted focal length over the given"), scales))
     return parts
 
 
@@ -205,7 +206,7 @@ def _verdict(imported: Imported) -> str:
     return "\n".join([f"**{lead}**", "", *(f"- {reason}" for reason in reasons)]).strip()
 
 
-def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def _table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [header, tuple("---" for _ in header), *rows]
     return "\n".join(
         "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in line) + " |" for line in lines

@@ -65,7 +65,7 @@ def adjust(
     depth_m: Floats | None = None,
     is_fixed: NDArray[np.bool_] | None = None,
 ) -> Bundle:
-    """Move frames, points and lenses to where points project to what is seen, with Cauchy's weights.
+    """Minimise the reprojection errors over poses, points and lenses, with Cauchy's robust loss.
 
     Args:
         start: the points are the tracks of ``seen``.

@@ -77,6 +77,17 @@ def test_reference_decodes_what_the_cache_holds(data):
     assert torch.equal(quaternion, batch.quaternion[3])
 
 
+def test_reference_has_our_optimiser(data):
+    system = create_model(
+        "atloc", backbone="resnet10t", width=32, image_size=32, lr=1e-3, beta2=0.98, weight_decay=0.01
+    )
+    ours = system.configure_optimizers()["optimizer"].defaults
+    theirs = ReferenceLoop(system, data, torch.device("cpu")).optimizer.defaults
+    names = ("lr", "betas", "eps")
+    assert {name: theirs[name] for name in names} == {name: ours[name] for name in names}
+    assert theirs["weight_decay"] == 0.01
+
+
 def test_reference_learns(data):
     torch.manual_seed(0)
     system = create_model("mambaloc", backbone="test_efficientnet", image_size=32, lr=1e-3, **SMALL)
