@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import runpy
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mambaloc.importing.capture import Capture
+
+_TOOL = Path(__file__).parents[2] / "tools" / "import_scene.py"
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 SIZE = (160, 120)
@@ -33,6 +39,18 @@ class Rendered:
         told = json.loads(file.read_text())
         change(told)
         file.write_text(json.dumps(told))
+
+
+def tool(*words: object) -> None:
+    """Run ``tools/import_scene.py`` in this process, which has imported what it needs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["tools/import_scene.py", *map(str, words)])
+        runpy.run_path(str(_TOOL), run_name="__main__")
+
+
+def told(folder: Path) -> dict[str, Any]:
+    """What the ``scene.json`` of an imported scene says."""
+    return json.loads((folder / "scene.json").read_text())
 
 
 def capture_of(world_from_cam: NDArray[np.float64], **told) -> Capture:
