@@ -36,6 +36,7 @@ def import_scene(
     split: str = "auto",
     command: str = "",
     with_adjusted: bool = False,
+    images: Path | None = None,
 ) -> Imported:
     """Read a capture, check it, split it, and write it as a scene's folder, which appears once it is whole.
 
@@ -47,6 +48,7 @@ def import_scene(
         split: of :data:`~mambaloc.importing.splits.selection.ASKED`.
         command: that this was asked for with.
         with_adjusted: also write poses that are adjusted to the pictures, in a file of their own.
+        images: the folder of the capture's images, where its format names them by paths; found unless given.
 
     Raises:
         InputError: for a source that is none, a folder that is there or cannot be written, or a split that cannot be
@@ -60,13 +62,14 @@ def import_scene(
         raise InputError(
             f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
         )
-    capture = read_capture(source, kind)
+    capture = read_capture(source, kind, images)
     capture, broken = _without(capture, sanity.bad_poses(capture.world_from_cam))
     capture = _near_the_origin(_in_metres(capture, metres_per_unit))
     capture, far = _without(capture, sanity.far_poses(capture.world_from_cam))
     with whole_folder(out, "choose another folder with --out") as partial:
         written = write_pictures(capture, partial)
-        imported = _checked(written, {**broken, **far, **written.rules}, split, with_adjusted)
+        left_out = {**capture.left_out, **broken, **far, **written.rules}
+        imported = _checked(written, left_out, split, with_adjusted)
         write_frames(imported, partial)
         if imported.capture.tracks:
             imported.capture.tracks.write(partial)

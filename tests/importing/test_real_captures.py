@@ -35,7 +35,7 @@ def test_bad_frames_are_left_out_and_named(rendered, tmp_path):
     assert {Path(file).name: rule for file, rule in imported.left_out.items()} == {
         "0004.png": "pose has NaN or infinite numbers",
         "0008.png": "image is truncated",
-        "0011.png": "image is 50x30, its camera's 160x120",
+        "0011.png": "image is 50x30, of another shape than its camera's 160x120",
     }
     said = told(tmp_path / "a")
     assert said["frames"]["used"] == 37

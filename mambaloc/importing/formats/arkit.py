@@ -11,7 +11,7 @@ nerfstudio. The world is that of the first camera, whatever way it was held (iss
 
 Polycam (raw data): ``keyframes/cameras/STAMP.json`` with ``t_00`` to ``t_23``, the rows of a camera-to-world matrix,
 ``fx fy cx cy width height``, and ``keyframes/images/STAMP.jpg``; better ``corrected_cameras`` and ``corrected_images``
-once the app has optimised them. STAMP is in microseconds. Source: the readme of github.com/PolyCam/polyform.
+once the app has optimised them; some versions leave ``width`` and ``height`` to ``cameras`` or to the image. STAMP is in microseconds. Source: the readme of github.com/PolyCam/polyform.
 
 ARCore: no app is known whose export of images with poses is common and documented, so there is no reader.
 """
@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX
+from mambaloc.images import CORNER_PX, read_image
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import (
     Posed,
@@ -109,7 +109,7 @@ def read_polycam(source: Path) -> Capture:
         raise InputError(f"{source}: has no keyframes/cameras/STAMP.json; export 'raw data' in developer mode")
     images = {image.stem: image for image in pictures(folders[1])}
     sequence, present = folder_name(source), [file for file in files if file.stem in images]
-    read = [_polycam_frame(file) for file in present]
+    read = [_polycam_frame(file, images[file.stem]) for file in present]
     names, cameras = _told_apart([camera for _, camera in read])
     stamps = all(number_of(file) >= 0 for file in present)
     posed = [
@@ -160,11 +160,24 @@ def _polycam_folders(source: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _polycam_frame(path: Path) -> tuple[np.ndarray, Camera]:
+def _polycam_frame(path: Path, image: Path) -> tuple[np.ndarray, Camera]:
+    """Pose and camera of a file and its image."""
     frame = read_object(path, "a camera of Polycam")
     keys = [f"t_{row}{column}" for row in range(3) for column in range(4)]
     matrix = array_of([frame.get(key) for key in keys], (12,), "t_00 to t_23", path).reshape(1, 3, 4)
     fx, fy, cx, cy = array_of([frame.get(key) for key in ("fx", "fy", "cx", "cy")], (4,), "fx, fy, cx, cy", path)
-    size = array_of([frame.get("width"), frame.get("height")], (2,), "width, height", path).tolist()
+    size = _polycam_size(frame, path, image)
     pose = validate_se3(matrix, lambda _: str(path))[0] @ OPENCV_FROM_OPENGL
     return pose, pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path)
+
+
+def _polycam_size(frame: dict[str, object], path: Path, image: Path) -> list[float]:
+    """Width and height that a camera is told for: by itself, by the one that was not corrected, or by its image."""
+    raw = path.parent.with_name(path.parent.name.removeprefix("corrected_")) / path.name
+    for file in dict.fromkeys((path, raw)):
+        told = frame if file == path else read_object(file, "a camera of Polycam") if file.is_file() else {}
+        sides = [told.get("width"), told.get("height")]
+        if sides != [None, None]:
+            return array_of(sides, (2,), "width, height", file).tolist()
+    height, width = read_image(image).shape[:2]
+    return [float(width), float(height)]
