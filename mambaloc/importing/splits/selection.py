@@ -30,9 +30,9 @@ REACH_DEG = 30.0
 RULE = (
     f"A proposal is honest where at most {MOST_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
     f"training frame, and learnable where the median test frame's nearest one is within {REACH:.0%} of the scene's "
-    f"extent and {REACH_DEG:g}°. A given split is taken, whatever it measures. Of the others, the first that is both is "
-    f"taken, in the order {', '.join(KINDS[1:])}; failing that, the one with the fewest near frames of those that are "
-    "learnable, or of all, and then the nearest."
+    f"extent and {REACH_DEG:g}°. A given split is taken, whatever it measures. Of the others, the first that is both "
+    f"is taken, in the order {', '.join(KINDS[1:])}; failing that, the one with the fewest near frames of those that "
+    "are learnable, or of all, and then the nearest."
 )
 
 _MEASURED = 400  # test frames at most, evenly spread
