@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import pictures, read_image
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
@@ -23,7 +23,6 @@ from mambaloc.importing.formats.parsing import (
     first_with_pictures,
     folder_name,
     number_of,
-    pictures,
     read_lines,
     read_table,
 )

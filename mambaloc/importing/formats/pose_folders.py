@@ -16,20 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import pictures, read_image
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
     array_of,
     as_numbers,
     folder_name,
-    natural,
     number_of,
-    pictures,
     read_object,
     read_table,
     read_text,
 )
+from mambaloc.text import natural
 
 _CHOICES = {
     "axes": "OpenCV camera axes, as the format has them",

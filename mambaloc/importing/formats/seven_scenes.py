@@ -18,6 +18,7 @@ from mambaloc.images import read_image
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, pinhole
 from mambaloc.runtime.rotations import matrix_from_quaternion
+from mambaloc.text import natural
 
 _CHOICES = {
     "axes": "OpenCV camera axes, as the format has them",
@@ -59,7 +60,7 @@ def read_seven_scenes(source: Path) -> Capture:
     return build_capture(
         "7scenes",
         source,
-        sorted(posed, key=lambda each: each.image),
+        sorted(posed, key=lambda each: natural(each.image)),
         unit="metre",
         choices=_CHOICES,
         cameras={"colour": camera},

@@ -21,10 +21,10 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 from mambaloc.data.colmap import import_pycolmap
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import pictures, read_image
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.colmap import read_colmap
-from mambaloc.importing.formats.parsing import first_with_pictures, folder_name, pictures
+from mambaloc.importing.formats.parsing import first_with_pictures, folder_name
 from mambaloc.importing.sfm.frame_choice import choose_frames
 from mambaloc.importing.sfm.reconstruction import NEIGHBOURS, find_features, match_features, place_images, quiet_colmap
 from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
