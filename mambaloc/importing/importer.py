@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.files import whole_folder
 from mambaloc.importing.canonical import Imported, write_frames, write_scene
-from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks import sanity
 from mambaloc.importing.checks.agreement import Agreement, agreement, check_agreement
 from mambaloc.importing.checks.conventions import check_axes, check_up, up_of
@@ -23,7 +21,7 @@ from mambaloc.importing.registry import read_capture
 from mambaloc.importing.report import write_report
 from mambaloc.importing.splits.advisor import propose
 from mambaloc.importing.splits.selection import ASKED, Chosen, Proposal, choose
-from mambaloc.importing.undistort.pictures import Size, selected, write_pictures
+from mambaloc.importing.undistort.pictures import Written, selected, write_pictures
 
 _MOST_SCALE = 1e6
 _FAR = 1000.0
@@ -67,8 +65,8 @@ def import_scene(
     capture = _near_the_origin(_in_metres(capture, metres_per_unit))
     capture, far = _without(capture, sanity.far_poses(capture.world_from_cam))
     with whole_folder(out, "choose another folder with --out") as partial:
-        written, sizes, rules = write_pictures(capture, partial)
-        imported = _checked(written, capture.cameras, sizes, {**broken, **far, **rules}, split, with_adjusted)
+        written = write_pictures(capture, partial)
+        imported = _checked(written, {**broken, **far, **written.rules}, split, with_adjusted)
         write_frames(imported, partial)
         if imported.capture.tracks:
             imported.capture.tracks.write(partial)
@@ -111,39 +109,27 @@ def _near_the_origin(capture: Capture) -> Capture:
     return replace(capture, world_from_cam=world_from_cam, choices={**capture.choices, "origin": told}, tracks=tracks)
 
 
-def _checked(
-    capture: Capture,
-    lenses: Mapping[str, Camera],
-    sizes: Sequence[Size],
-    left_out: Mapping[str, str],
-    asked: str,
-    with_adjusted: bool,
-) -> Imported:
-    """Check what was written, and split what can be used of it."""
-    usable = _of_the_usual_shape(sizes)
-    odd = len(sizes) - len(usable)
-    findings = [sanity.check_frames(len(usable), left_out), sanity.check_missing(capture)]
+def _checked(written: Written, left_out: Mapping[str, str], asked: str, with_adjusted: bool) -> Imported:
+    """Check what was written, and split it."""
+    capture = written.capture
+    findings = [sanity.check_frames(capture, left_out), sanity.check_missing(capture)]
     proposals: list[Proposal] = []
     chosen: Chosen | None = None
     agreeing: Agreement | None = None
-    adjusted = None
     split = np.full(len(capture.images), "unused", dtype="<U6")
     if not any(finding.is_fatal for finding in findings):
-        used = selected(capture, usable)
-        motion = motion_of(used)
-        agreeing = agreement(used, motion, with_adjusted)
-        if agreeing.adjusted is not None:
-            adjusted = capture.world_from_cam.copy()
-            adjusted[usable] = agreeing.adjusted.world_from_cam
-        findings += [sanity.check_sizes(sizes, odd), *check_agreement(agreeing), *_of_poses(used, motion)]
+        motion = motion_of(capture)
+        agreeing = agreement(capture, motion, with_adjusted)
+        findings += [sanity.check_sizes(written.sizes), *check_agreement(agreeing), *_of_poses(capture, motion)]
         if not any(finding.is_fatal for finding in findings):
-            proposals = propose(used, motion)
+            proposals = propose(capture, motion)
             chosen = choose(proposals, asked)
-            split[usable] = chosen.proposal.split
+            split = chosen.proposal.split
             findings.append(Finding("split", f"by {chosen.proposal.kind}: {chosen.proposal.how}", chosen.warning))
+    adjusted = None if agreeing is None else agreeing.adjusted
     return Imported(
         capture=capture,
-        lenses=lenses,
+        lenses=written.lenses,
         split=tuple(split.tolist()),
         findings=tuple(findings),
         verdict=verdict_of(findings),
@@ -151,7 +137,7 @@ def _checked(
         chosen=chosen,
         left_out=left_out,
         agreement=agreeing,
-        adjusted=adjusted,
+        adjusted=None if adjusted is None else np.asarray(adjusted.world_from_cam, np.float64),
     )
 
 
@@ -165,10 +151,3 @@ def _of_poses(capture: Capture, motion: Motion) -> list[Finding]:
         sanity.check_duplicates(capture, motion),
         sanity.check_times(capture),
     ]
-
-
-def _of_the_usual_shape(sizes: Sequence[Size]) -> list[int]:
-    """Rows of images of the most common ratio of sides: a training has one crop for all."""
-    shapes = [Fraction(*size) for size in sizes]
-    usual = Counter(shapes).most_common(1)[0][0] if shapes else None
-    return [row for row, shape in enumerate(shapes) if shape == usual]
