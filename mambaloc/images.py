@@ -154,13 +154,27 @@ def read_image(path: str | Path, counts: Counts | None = None) -> Image:
     Raises:
         InputError: where it is missing or no whole image, or has 16 bits and does not use them.
     """
+    return _read(path, True, counts)
+
+
+def _read(path: str | Path, upright: bool, counts: Counts | None) -> Image:
     try:
-        image = decode_image(Path(path).read_bytes(), counts=counts)
+        image = decode_image(Path(path).read_bytes(), upright, counts)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a picture") from None
     if isinstance(image, str):
         raise InputError(f"{path}: {image}" if image.endswith(".") else f"{path}: {image}; give a whole JPEG or PNG")
     return image
+
+
+def stored_size(path: str | Path) -> tuple[int, int]:
+    """(width, height) of a picture as its file stores it, which is what a camera's intrinsics are of.
+
+    Raises:
+        InputError: as :func:`read_image`, but not for what its 16 bits hold.
+    """
+    height, width = _read(path, False, FULL_COUNTS).shape[:2]
+    return width, height
 
 
 def as_rgb(image: Image) -> Image:
