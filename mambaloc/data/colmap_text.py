@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import TextIO
 
 from mambaloc.errors import InputError
+from mambaloc.text import encoding_of_file
 
 _PICTURE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _BEFORE_NAME = 9  # words
@@ -120,14 +121,12 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 if not line.startswith("#"):
                     yield number, line.strip()
         except UnicodeDecodeError:
-            raise InputError(f"{path}, line {number + 1}: is no UTF-8; save the file as UTF-8") from None
+            raise InputError(f"{path}, line {number + 1}: is no text; save the file as UTF-8") from None
 
 
 def _opened(path: Path) -> TextIO:
-    """A text in UTF-8, or in UTF-16 as some editors save it, with whatever ends of lines."""
+    """A text in any usual encoding, with whatever ends of lines."""
     try:
-        with path.open("rb") as file:
-            is_utf16 = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
-        return path.open(encoding="utf-16" if is_utf16 else "utf-8-sig")
+        return path.open(encoding=encoding_of_file(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); export the model again") from None

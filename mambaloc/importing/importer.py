@@ -123,7 +123,8 @@ def _checked(written: Written, left_out: Mapping[str, str], asked: str, with_adj
     if not any(finding.is_fatal for finding in findings):
         motion = motion_of(capture)
         agreeing = agreement(capture, motion, with_adjusted)
-        findings += [sanity.check_sizes(written.sizes), *check_agreement(agreeing), *_of_poses(capture, motion)]
+        findings += [sanity.check_sizes(written.sizes), sanity.check_pixels(written.decoding)]
+        findings += [*check_agreement(agreeing), *_of_poses(capture, motion)]
         if not any(finding.is_fatal for finding in findings):
             proposals = propose(capture, motion)
             chosen = choose(proposals, asked)

@@ -12,6 +12,7 @@ from mambaloc.data.frames import FARTHEST, ROTATION_TOLERANCE
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.findings import Finding
 from mambaloc.importing.motion import Motion, quaternions
+from mambaloc.importing.undistort.decoding import Decoding
 from mambaloc.importing.undistort.fitting import is_same_shape
 from mambaloc.runtime.rotations import is_rotation
 
@@ -117,6 +118,18 @@ def check_sizes(sizes: Sequence[tuple[int, int]]) -> Finding:
         )
     figures = {"sizes": {f"{width}x{height}": count for (width, height), count in counted}, "of_another_shape": odd}
     return Finding("image size", said, concern, figures=figures)
+
+
+def check_pixels(decoding: Decoding) -> Finding:
+    """Say which pixels of a picture with an EXIF orientation its pose means."""
+    concern = ""
+    if decoding.oriented and not decoding.upright and not decoding.known:
+        concern = (
+            f"{decoding.oriented} pictures have an EXIF orientation, and the format does not say whether poses mean "
+            "stored or upright pixels: taken as stored. If they mean upright ones, write the pictures so first, as "
+            "mogrify -auto-orient does"
+        )
+    return Finding("pixels", decoding.choices()["pixels"], concern, figures={"oriented": decoding.oriented})
 
 
 def check_steps(capture: Capture, motion: Motion, unit: str) -> Finding:

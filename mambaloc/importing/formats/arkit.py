@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX, read_image
+from mambaloc.images import CORNER_PX, pictures, read_image
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import (
     Posed,
@@ -34,15 +34,8 @@ from mambaloc.importing.formats.builder import (
     pinhole,
     validate_se3,
 )
-from mambaloc.importing.formats.parsing import (
-    array_of,
-    first_with_pictures,
-    folder_name,
-    natural,
-    number_of,
-    pictures,
-    read_object,
-)
+from mambaloc.importing.formats.parsing import array_of, first_with_pictures, folder_name, number_of, read_object
+from mambaloc.text import natural
 
 _OFF_CENTRE = 0.05
 _CHOICES = {

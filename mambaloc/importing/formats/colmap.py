@@ -26,7 +26,8 @@ from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, validate_se3
 from mambaloc.importing.formats.finding import SMALLER, Found, find_pictures
-from mambaloc.importing.formats.parsing import folder_name, natural, pictures_beside
+from mambaloc.importing.formats.parsing import folder_name, pictures_beside
+from mambaloc.text import natural
 
 _ROOTS = ("sparse", ".", "colmap/sparse")
 _NAMED = 3  # other models

@@ -18,8 +18,9 @@ from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture
 from mambaloc.importing.formats.finding import find_pictures
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
-from mambaloc.importing.formats.parsing import natural, pictures_beside, read_object
+from mambaloc.importing.formats.parsing import pictures_beside, read_object
 from mambaloc.runtime.rotations import is_rotation
+from mambaloc.text import natural
 
 FILES: Mapping[str, str | None] = {
     "transforms.json": None,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import PICTURES
+from mambaloc.images import PICTURES, pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
 from mambaloc.importing.formats.parsing import (
@@ -25,7 +25,6 @@ from mambaloc.importing.formats.parsing import (
     first_with_pictures,
     folder_name,
     inside,
-    pictures,
     read_lines,
     read_table,
 )

@@ -15,8 +15,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from mambaloc.images import Image, center_cropped, decode_image
+from mambaloc.exif import orientation_of, without_exif
+from mambaloc.images import Image, center_cropped
 from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.undistort.decoding import Decoding, decoding_of
 from mambaloc.importing.undistort.fitting import FittedCameras, Size, common_sizes
 
 IMAGES = "images"
@@ -33,31 +35,33 @@ class Written(NamedTuple):
         sizes: (width, height) of each image.
         rules: the rule that each of the others breaks, by file.
         lenses: the cameras by the same names as the capture's, as they took the pictures.
+        decoding: how the pictures were decoded.
     """
 
     capture: Capture
     sizes: list[Size]
     rules: dict[str, str]
     lenses: dict[str, Camera]
+    decoding: Decoding
 
 
 def write_pictures(capture: Capture, folder: Path) -> Written:
     """Write every image that can be decoded and has its camera's shape to ``FOLDER/images/SEQUENCE/NAME``.
 
-    Files are copied byte by byte, unless they lie on their side, distortion is removed from them, or sizes that are
-    near each other are cropped to one.
+    Each has the pixels that its pose means, with 8 bits and without an EXIF orientation. Files are copied byte by byte
+    where nothing is to be done: neither this, nor distortion to be removed, nor sizes near each other to be made one.
 
     Raises:
         InputError: where a camera's distortion is that of no lens.
     """
-    cameras = FittedCameras(capture.cameras)
+    cameras, decoding = FittedCameras(capture.cameras), decoding_of(capture)
     targets = [folder / IMAGES / name for name in _names(capture)]
     for parent in {target.parent for target in targets}:
         parent.mkdir(parents=True, exist_ok=True)
 
     def write(row: int, crop: Size | None = None) -> Size | str:
         name = None if capture.camera_of is None else capture.camera_of[row]
-        return _write(capture.images[row], targets[row], cameras, name, crop)
+        return _write(capture.images[row], targets[row], decoding, cameras, name, crop)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = pool.map(write, range(len(targets)))
@@ -70,9 +74,9 @@ def write_pictures(capture: Capture, folder: Path) -> Written:
     kept = selected(capture, list(taken))
     names, pinholes, lenses = cameras.as_used(kept.camera_of, list(taken.values()), common)
     said = _said(capture.cameras, lenses, len(odd), len(taken))
-    images, choices = tuple(targets[row] for row in taken), {**capture.choices, **said}
+    images, choices = tuple(targets[row] for row in taken), {**capture.choices, **decoding.choices(), **said}
     kept = replace(kept, images=images, cameras=pinholes, camera_of=names, choices=choices)
-    return Written(kept, [common[size] for size in taken.values()], rules, lenses)
+    return Written(kept, [common[size] for size in taken.values()], rules, lenses, decoding)
 
 
 def _said(told: Mapping[str, Camera], lenses: Mapping[str, Camera], odd: int, count: int) -> dict[str, str]:
@@ -107,37 +111,47 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
     )
 
 
-def _write(source: Path, target: Path, cameras: FittedCameras, name: str | None, crop: Size | None) -> Size | str:
+def _write(
+    source: Path, target: Path, decoding: Decoding, cameras: FittedCameras, name: str | None, crop: Size | None
+) -> Size | str:
     """Write an image, or the middle of it, and return its (width, height), or the rule that it breaks."""
     try:
         data = source.read_bytes()
     except OSError:
         return "image cannot be read"
-    image = decode_image(data)
-    if isinstance(image, str):
-        return image
-    is_as_it_is, maps = crop is None, None
+    first, *others = decoding.ways(data)
+    if isinstance(first, str):
+        return first
+    image, maps = first, None
     if name is not None:
         own = cameras.size(name)
-        # Structure from motion may have ignored the EXIF orientation: the camera's size tells which way round it is.
-        ways = [image] if _size(image) == own else [image, decode_image(data, upright=False)]
+        # A camera's size may tell that a pose means a picture the other way round.
+        ways = [first] if _size(first) == own else [first, *others]
         fits = [(way, cameras.fitted(name, _size(way))) for way in ways if not isinstance(way, str)]
-        best, fit = max(fits, key=lambda fit: (_size(fit[0]) == own, fit[1] is not None))
+        image, fit = max(fits, key=lambda fit: (_size(fit[0]) == own, fit[1] is not None))
         if fit is None:
             return f"image is {_times(_size(image))}, of another shape than its camera's {_times(own)}"
-        is_as_it_is, image, maps = is_as_it_is and best is image, best, fit[1]
+        maps = fit[1]
+    is_upright = decoding.upright == (image is first)
+    if maps is None and crop is None and (copy := _untagged(data, is_upright)) and target.suffix in _KEPT_SUFFIXES:
+        target.write_bytes(copy)
+        return _size(image)
     if maps is not None:
         # The border's last hundredth of a pixel is rounding, and nothing to be black.
         image = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
-        is_as_it_is = False
     if crop is not None:
         image = center_cropped(image, crop[::-1])
-    if is_as_it_is and source.suffix.lower() in _KEPT_SUFFIXES:
-        target.write_bytes(data)
-    else:
-        options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if target.suffix != ".png" else []
-        target.write_bytes(cv2.imencode(target.suffix, image[..., ::-1], options)[1].tobytes())
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if target.suffix != ".png" else []
+    target.write_bytes(cv2.imencode(target.suffix, image[..., ::-1], options)[1].tobytes())
     return _size(image)
+
+
+def _untagged(data: bytes, is_upright: bool) -> bytes | None:
+    """The file of a JPEG or PNG of 8 bits without its orientation, its pixels as stored; None where it is another."""
+    is_jpeg, is_png = data.startswith(b"\xff\xd8"), data.startswith(b"\x89PNG") and data[24] <= 8
+    if orientation_of(data) == 1:
+        return data if is_jpeg or is_png else None
+    return without_exif(data) if is_jpeg and not is_upright else None
 
 
 def _size(image: Image) -> Size:
