@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.data.tracks import Tracks
+from mambaloc.runtime.world import World
 
 Unit = Literal["metre", "unknown"]
 
@@ -73,6 +74,7 @@ class Capture:
         images_without_pose: images beside those used.
         depth: of the images, where the format has it and the images are those of a pinhole.
         tracks: points that the format says the images see.
+        world: where positions lie in the source's world.
     """
 
     kind: str
@@ -89,3 +91,4 @@ class Capture:
     images_without_pose: tuple[Path, ...] = ()
     depth: Depth | None = None
     tracks: Tracks | None = None
+    world: World = field(default_factory=World)

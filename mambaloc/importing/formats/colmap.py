@@ -48,8 +48,6 @@ def read_colmap(source: Path) -> Capture:
         raise InputError(f"{path}: places none of its {len(model.images)} images; reconstruct again")
     files = _files(source, path, [image.name for image in images])
     cam_from_world = np.array([image.cam_from_world().matrix() for image in images])
-    if not np.isfinite(cam_from_world).all():
-        raise InputError(f"{path}: has a pose with NaN or infinite numbers; export it again")
     world_from_cam = np.linalg.inv(validate_se3(cam_from_world, lambda row: f"{path}, image {images[row].name[:80]!r}"))
     cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(images)}
     posed, missing = [], []

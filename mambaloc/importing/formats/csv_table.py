@@ -33,6 +33,7 @@ _TRANSPOSENET = (_POSITIONS[2], _QUATERNIONS[1])
 _SEQUENCE = ("seq", "sequence")
 _TIME = ("time", "time_s", "timestamp")
 _SPLITS = {"train": "train", "training": "train", "test": "test", "val": "val", "valid": "val", "validation": "val"}
+_NO_FIX = ("", "null", "none", "na", "n/a", "-")
 _CAMBRIDGE = ("KingsCollege", "OldHospital", "ShopFacade", "StMarysChurch", "GreatCourt", "Street")
 
 
@@ -189,10 +190,11 @@ def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction:
 
 
 def _numbers(path: Path, line: int, row: dict[str, str], columns: _Columns) -> np.ndarray:
-    values = as_numbers([row[name] for name in (*columns.position, *columns.quaternion)])
-    if values is None or not np.isfinite(values).all():
+    words = [row[name] for name in (*columns.position, *columns.quaternion)]
+    values = as_numbers(["nan" if word.lower() in _NO_FIX else word for word in words])
+    if values is None:
         names = ",".join((*columns.position, *columns.quaternion))
-        raise InputError(f"{path}, line {line}: {names} must be finite numbers; correct or remove the row")
+        raise InputError(f"{path}, line {line}: {names} must be numbers; correct or remove the row")
     return values
 
 
