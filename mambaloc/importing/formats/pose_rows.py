@@ -103,17 +103,19 @@ def _layout(rows: Sequence[tuple[str, list[str]]], header: tuple[str, ...]) -> L
         return None
     table = numbers.reshape(len(usual), count)
     if count == 7:
-        places = [place for place in (3, 0) if _is_unit(table, table[:, place : place + 4])]
-        return Layout(is_named, is_text, 7, quaternion=places[0], header=header) if places else None
+        places = {place: _unit_rows(table, table[:, place : place + 4]) for place in (3, 0)}
+        place = max(places, key=lambda each: places[each])
+        return Layout(is_named, is_text, 7, quaternion=place, header=header) if places[place] else None
     by_column = is_by_column(table)
     return None if by_column is None else Layout(is_named, is_text, count, by_column)
 
 
-def _is_unit(poses: Matrices, quaternions: Matrices) -> bool:
+def _unit_rows(poses: Matrices, quaternions: Matrices) -> int:
+    """How many quaternions have unit length, where nearly all do that are no marks; 0 otherwise."""
     quaternions = quaternions[~is_mark(poses, quaternions)]
     with np.errstate(over="ignore"):
-        off = np.abs(np.linalg.norm(quaternions, axis=1) - 1)
-    return len(off) > 0 and bool((off < _TOLERANCE).mean() >= _NEARLY_ALL)
+        are_unit = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < _TOLERANCE
+    return int(are_unit.sum()) if are_unit.sum() >= _NEARLY_ALL * len(quaternions) else 0
 
 
 def is_by_column(table: Matrices) -> bool | None:
