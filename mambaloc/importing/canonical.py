@@ -162,7 +162,9 @@ def _described(camera: Camera, lens: Camera) -> dict[str, Any]:
         "centre_px": list(camera.centre_px),
     }
     if lens.distorted is None:
-        return {**told, "images": "as they were: the camera is a pinhole", "model": lens.model}
+        is_whole = (lens.width, lens.height) == (camera.width, camera.height)
+        images = "as they were" if is_whole else f"the middle of {lens.width}x{lens.height}"
+        return {**told, "images": f"{images}: the camera is a pinhole", "model": lens.model}
     was = {"model": lens.model, "focal_px": list(lens.focal_px), "centre_px": list(lens.centre_px)}
     zoom = camera.focal_px[0] / lens.focal_px[0]
     return {**told, "images": f"distortion removed; zoomed by {zoom:.4f}, so that no border is black", "lens": was}

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from fractions import Fraction
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,7 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.files import whole_folder
 from mambaloc.importing.canonical import Imported, write_frames, write_scene
-from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks import sanity
 from mambaloc.importing.checks.agreement import Agreement, agreement, check_agreement
 from mambaloc.importing.checks.conventions import check_axes, check_up, up_of
@@ -22,7 +20,7 @@ from mambaloc.importing.registry import read_capture
 from mambaloc.importing.report import write_report
 from mambaloc.importing.splits.advisor import propose
 from mambaloc.importing.splits.selection import ASKED, Chosen, Proposal, choose
-from mambaloc.importing.undistort.pictures import Size, selected, write_pictures
+from mambaloc.importing.undistort.pictures import Written, write_pictures
 from mambaloc.importing.world import in_its_world
 
 _MOST_SCALE = 1e6
@@ -62,8 +60,8 @@ def import_scene(
         )
     capture, left_out = in_its_world(read_capture(source, kind), metres_per_unit)
     with whole_folder(out, "choose another folder with --out") as partial:
-        written, sizes, rules = write_pictures(capture, partial)
-        imported = _checked(written, capture.cameras, sizes, {**left_out, **rules}, split, with_adjusted)
+        written = write_pictures(capture, partial)
+        imported = _checked(written, {**left_out, **written.rules}, split, with_adjusted)
         write_frames(imported, partial)
         if imported.capture.tracks:
             imported.capture.tracks.write(partial)
@@ -72,39 +70,28 @@ def import_scene(
     return imported
 
 
-def _checked(
-    capture: Capture,
-    lenses: Mapping[str, Camera],
-    sizes: Sequence[Size],
-    left_out: Mapping[str, str],
-    asked: str,
-    with_adjusted: bool,
-) -> Imported:
-    """Check what was written, and split what can be used of it."""
-    usable = _of_the_usual_shape(sizes)
-    odd = len(sizes) - len(usable)
-    findings = [sanity.check_frames(len(usable), left_out), sanity.check_missing(capture)]
+def _checked(written: Written, left_out: Mapping[str, str], asked: str, with_adjusted: bool) -> Imported:
+    """Check what was written, and split it."""
+    capture = written.capture
+    findings = [sanity.check_frames(capture, left_out), sanity.check_missing(capture)]
     proposals: list[Proposal] = []
     chosen: Chosen | None = None
     agreeing: Agreement | None = None
-    adjusted = None
     split = np.full(len(capture.images), "unused", dtype="<U6")
     if not any(finding.is_fatal for finding in findings):
-        used = selected(capture, usable)
-        motion = motion_of(used)
-        agreeing = agreement(used, motion, with_adjusted)
-        if agreeing.adjusted is not None:
-            adjusted = capture.world_from_cam.copy()
-            adjusted[usable] = agreeing.adjusted.world_from_cam
-        findings += [sanity.check_sizes(sizes, odd), *check_agreement(agreeing), *_of_poses(used, motion)]
+        motion = motion_of(capture)
+        agreeing = agreement(capture, motion, with_adjusted)
+        findings += [sanity.check_sizes(written.sizes), sanity.check_pixels(written.decoding)]
+        findings += [*check_agreement(agreeing), *_of_poses(capture, motion)]
         if not any(finding.is_fatal for finding in findings):
-            proposals = propose(used, motion)
+            proposals = propose(capture, motion)
             chosen = choose(proposals, asked)
-            split[usable] = chosen.proposal.split
+            split = chosen.proposal.split
             findings.append(Finding("split", f"by {chosen.proposal.kind}: {chosen.proposal.how}", chosen.warning))
+    adjusted = None if agreeing is None else agreeing.adjusted
     return Imported(
         capture=capture,
-        lenses=lenses,
+        lenses=written.lenses,
         split=tuple(split.tolist()),
         findings=tuple(findings),
         verdict=verdict_of(findings),
@@ -112,7 +99,7 @@ def _checked(
         chosen=chosen,
         left_out=left_out,
         agreement=agreeing,
-        adjusted=adjusted,
+        adjusted=None if adjusted is None else np.asarray(adjusted.world_from_cam, np.float64),
     )
 
 
@@ -126,10 +113,3 @@ def _of_poses(capture: Capture, motion: Motion) -> list[Finding]:
         sanity.check_duplicates(capture, motion),
         sanity.check_times(capture),
     ]
-
-
-def _of_the_usual_shape(sizes: Sequence[Size]) -> list[int]:
-    """Rows of images of the most common ratio of sides: a training has one crop for all."""
-    shapes = [Fraction(*size) for size in sizes]
-    usual = Counter(shapes).most_common(1)[0][0] if shapes else None
-    return [row for row, shape in enumerate(shapes) if shape == usual]

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX
+from mambaloc.images import CORNER_PX, pictures
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import (
     Posed,
@@ -32,15 +32,8 @@ from mambaloc.importing.formats.builder import (
     pinhole,
     validate_se3,
 )
-from mambaloc.importing.formats.parsing import (
-    array_of,
-    first_with_pictures,
-    folder_name,
-    natural,
-    number_of,
-    pictures,
-    read_object,
-)
+from mambaloc.importing.formats.parsing import array_of, first_with_pictures, folder_name, number_of, read_object
+from mambaloc.text import natural
 
 _CHOICES = {
     "axes": "ARKit's camera axes (y up, looking along -z) turned to OpenCV's; the world is kept",

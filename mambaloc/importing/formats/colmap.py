@@ -22,7 +22,8 @@ from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, validate_se3
-from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures_beside
+from mambaloc.importing.formats.parsing import folder_name, inside, pictures_beside
+from mambaloc.text import natural
 
 _PLACES = (*COLMAP_FOLDERS, ".")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")

@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
+from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
 from mambaloc.importing.formats.parsing import (
@@ -28,7 +29,6 @@ from mambaloc.importing.formats.parsing import (
     first_with_pictures,
     folder_name,
     inside,
-    pictures,
     pictures_beside,
     read_text,
 )
@@ -229,7 +229,8 @@ def _by_image(path: Path, rows: list[Row], columns: _Columns) -> _Pictured:
         stamps = stamps_of([row[columns.time] for _, row in rows])
         if stamps is None:
             line, row = next(((line, row) for line, row in rows if stamps_of([row[columns.time]]) is None), rows[0])
-            raise InputError(f"{path}, line {line}: time {row[columns.time][:40]!r} is no number of seconds; correct it")
+            time = row[columns.time][:40]
+            raise InputError(f"{path}, line {line}: time {time!r} is no number of seconds; correct it")
     frames: list[tuple[Path, str, int, float | None]] = []
     for place, ((_, row), image) in enumerate(zip(rows, images, strict=True)):
         if image.is_file():

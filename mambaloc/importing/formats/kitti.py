@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import pictures, stored_size
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
     as_numbers,
     first_with_pictures,
     number_of,
-    pictures,
     read_lines,
     read_table,
 )
@@ -130,8 +129,8 @@ def _camera(calibration: Path, name: str, image: Path) -> tuple[Camera, Matrices
     matrix = projection[:, :3]
     if not np.array_equal(matrix[2], (0, 0, 1)) or matrix[1, 0] != 0 or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise InputError(f"{calibration}: '{key}' is no projection K [I | t] of a rectified camera; get it again")
-    height, width = read_image(image).shape[:2]
-    camera = pinhole((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), calibration)
+    size = stored_size(image)
+    camera = pinhole(size, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), calibration)
     cam0_from_cam = np.eye(4)
     with np.errstate(over="ignore", invalid="ignore"):
         cam0_from_cam[:3, 3] = -np.linalg.solve(matrix, projection[:, 3])

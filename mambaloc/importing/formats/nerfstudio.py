@@ -17,8 +17,9 @@ from mambaloc.images import PICTURES
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
-from mambaloc.importing.formats.parsing import inside, natural, pictures_beside, read_object
+from mambaloc.importing.formats.parsing import inside, pictures_beside, read_object
 from mambaloc.runtime.rotations import is_rotation
+from mambaloc.text import natural
 
 FILES: Mapping[str, str | None] = {
     "transforms.json": None,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX, decode_image
+from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX, stored_size
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
 
@@ -150,12 +150,14 @@ def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
 
 
 def _first_size(images: Sequence[Path]) -> tuple[int, int]:
-    """Width and height of the first image that can be decoded."""
+    """Width and height of the first image that can be decoded, as its file stores it."""
+    reasons = []
     for path in images:
-        image = decode_image(path.read_bytes())
-        if not isinstance(image, str):
-            return image.shape[1], image.shape[0]
-    raise InputError(f"{images[0]}: neither it nor any other of {len(images)} images can be decoded; add them again")
+        try:
+            return stored_size(path)
+        except InputError as error:
+            reasons.append(str(error))
+    raise InputError(f"{reasons[0]} (neither it nor any other of {len(images)} images can be decoded)")
 
 
 def _said(cameras: Mapping[str, Camera], told: Mapping[str, Any], size: tuple[int, int]) -> str:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
-from mambaloc.images import PICTURES
+from mambaloc.images import PICTURES, pictures
+from mambaloc.text import decode_text
 
 _MOST_BYTES = 1 << 26  # of a text: poses of a million images
 
@@ -54,7 +55,7 @@ def read_text(path: Path, holds: str) -> str:
             raise InputError(f"{path}: missing; it holds {holds}")
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; give a text that holds {holds}")
-        return path.read_text(encoding="utf-8-sig", errors="replace")
+        return decode_text(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); it holds {holds}") from None
 
@@ -151,30 +152,6 @@ def inside(folder: Path, name: Any, where: str) -> Path:
     if path is None:
         raise InputError(f"{where}: names {str(name)[:60]!r}, which is no file inside of {folder}; correct the name")
     return path
-
-
-def natural(path: Path) -> tuple[tuple[int, str, int, str], ...]:
-    """Key to sort files as a person does: ``2.jpg`` before ``10.jpg``."""
-    words = re.split(r"([0-9]+)", path.as_posix())
-    # Digits by their count, then one by one: Python refuses to make an int of more than 4300.
-    numbers = [word.lstrip("0") for word in words]
-    return tuple(
-        (1, "", len(number), number) if place % 2 else (0, word, 0, "")
-        for place, (word, number) in enumerate(zip(words, numbers, strict=True))
-    )
-
-
-def pictures(folder: Path) -> list[Path]:
-    """The pictures in a folder in natural order, without depth; none where there is no such folder.
-
-    Raises:
-        InputError: where it may not be read.
-    """
-    try:
-        files = list(folder.iterdir()) if folder.is_dir() else []
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}); make it readable") from None
-    return sorted((p for p in files if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural)
 
 
 def pictures_beside(images: Iterable[Path]) -> list[Path]:

@@ -17,12 +17,13 @@ import numpy as np
 
 from mambaloc.data.points.depth import INTRINSICS_FILE, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import pictures, stored_size
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, natural, number_of, pictures, read_text
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, number_of, read_text
 from mambaloc.importing.formats.pose_lines import Direction, towards_world
 from mambaloc.importing.formats.pose_rows import is_by_column, matrices_of
+from mambaloc.text import natural
 
 _SUFFIXES = (".txt", ".pose", ".npy")
 _OF_PICTURES = ("rgb", "color", "images", "image", "img", "frames")
@@ -216,7 +217,7 @@ def _read_matrices(files: list[Path]) -> tuple[Matrices, bool]:
 
 def _official_camera(image: Path) -> Camera | None:
     """The colour camera of 7-Scenes, where a picture has its size."""
-    height, width = read_image(image).shape[:2]
+    width, height = stored_size(image)
     if (width, height) != _OFFICIAL_SIZE:
         return None
     return pinhole((width, height), (_OFFICIAL_FOCAL_PX,) * 2, ((width - 1) / 2, (height - 1) / 2), image)

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX, PICTURES
+from mambaloc.images import CORNER_PX, PICTURES, pictures
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
@@ -25,7 +25,6 @@ from mambaloc.importing.formats.parsing import (
     first_with_pictures,
     folder_name,
     inside,
-    pictures,
     pictures_beside,
     read_lines,
 )

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import PICTURES
+from mambaloc.images import PICTURES, pictures
 from mambaloc.importing.formats.builder import Matrices, is_mark
-from mambaloc.importing.formats.parsing import Table, as_numbers, pictures, read_text
+from mambaloc.importing.formats.parsing import Table, as_numbers, read_text
 from mambaloc.runtime.rotations import is_rotation
 
 SUFFIXES = ("", ".txt", ".tum", ".kitti", ".log", ".dat", ".tsv")

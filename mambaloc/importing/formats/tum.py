@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
+from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
 from mambaloc.importing.formats.parsing import (
@@ -22,7 +23,6 @@ from mambaloc.importing.formats.parsing import (
     first_with_pictures,
     folder_name,
     inside,
-    pictures,
     read_lines,
 )
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS, Layout, layout_of, pose_files, read_rows
