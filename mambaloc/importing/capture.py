@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.data.tracks import Tracks
+from mambaloc.runtime.world import World
 
 Unit = Literal["metre", "unknown"]
 
@@ -74,6 +75,7 @@ class Capture:
         left_out: why frames are left out that the format itself marks as bad, by file.
         depth: of the images, where the format has it and the images are those of a pinhole.
         tracks: points that the format says the images see.
+        world: where positions lie in the source's world.
     """
 
     kind: str
@@ -91,3 +93,4 @@ class Capture:
     left_out: Mapping[str, str] = field(default_factory=dict)
     depth: Depth | None = None
     tracks: Tracks | None = None
+    world: World = field(default_factory=World)

@@ -62,7 +62,7 @@ def read_record3d(source: Path) -> Capture:
         raise InputError(f"{source}: is an archive; unpack it (unzip {source.name} -d FOLDER) and give the folder")
     path = _metadata(source)
     metadata = read_object(path, "poses, K, w and h of a Record3D recording")
-    rows = array_of(metadata.get("poses"), (None, 7), "poses", path)
+    rows = array_of(metadata.get("poses"), (None, 7), "poses", path, may_lack_fix=True)
     if len(rows) > 1 and not np.ptp(rows, axis=0).any():
         raise InputError(f"{path}: all {len(rows)} poses are the same; record with the LiDAR camera, which is tracked")
     quaternion = np.roll(rows[:, :4], 1, axis=1)

@@ -59,8 +59,6 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
         raise InputError(f"{path}: places none of its {len(model.images)} images; reconstruct again")
     found = _find(source, path, images, [image.name for image in placed])
     cam_from_world = np.array([image.cam_from_world().matrix() for image in placed])
-    if not np.isfinite(cam_from_world).all():
-        raise InputError(f"{path}: has a pose with NaN or infinite numbers; export it again")
     world_from_cam = np.linalg.inv(validate_se3(cam_from_world, lambda row: f"{path}, image {placed[row].name[:80]!r}"))
     cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(placed)}
     posed, missing = [], []
