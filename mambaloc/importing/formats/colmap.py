@@ -63,7 +63,7 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
     cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(placed)}
     posed, missing = [], []
     for image, file, pose in zip(placed, found.files, world_from_cam, strict=True):
-        if file.is_file():
+        if file not in found.missing:
             posed.append(Posed(file, _sequence(image.name, source), pose, f"camera-{image.camera_id}"))
         else:
             missing.append(image.name)

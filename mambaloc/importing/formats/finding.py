@@ -22,6 +22,7 @@ SMALLER = ("_2", "_4", "_8")
 """What the folders of smaller copies add to a folder's name, the largest first: those of splatting data sets."""
 
 _MOST_FILES = 1_000_000
+_LONGEST_NAME = 255  # bytes
 _GIVE = "Give the folder of the pictures with --images."
 _GIVE_ELSE = "If they are elsewhere, give their folder with --images."
 
@@ -34,10 +35,12 @@ class Found:
 
     Args:
         files: of each name, there or not.
+        missing: those that are not.
         elsewhere: how those were found that are not where their names say, in a line; empty where all are.
     """
 
     files: tuple[Path, ...]
+    missing: frozenset[Path] = frozenset()
     elsewhere: str = ""
 
     @property
@@ -59,22 +62,14 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
 
     Raises:
         InputError: for a path that no file has, that leads out of the root where no picture below ends like it, or that
-            may mean two pictures.
+            may mean two pictures; and where no picture is there.
     """
-    direct = [_direct(root, name, where) for name, where in named]
+    direct = [path_inside(root, name) if isinstance(name, str) else None for name, _ in named]
     files = [None if path is None else _there(root, path) for path in direct]
-    taken = {file for file in files if file is not None}
     lost = [row for row, file in enumerate(files) if file is None]
-    if not lost:
-        return Found(tuple(file for file in files if file is not None))
-    tails = _Tails(root)
-    least = 1 if len({_parts(name)[:-1] for name, _ in named}) == 1 else 2
-    moved: list[int] = []
-    for row in lost:
-        file = tails.find(_parts(named[row][0]), least, *named[row])
-        if file is not None and file not in taken:
-            files[row] = file
-            moved.append(row)
+    moved = _by_tails(root, [named[row] for row in lost], {file for file in files if file}, named) if lost else []
+    for row, file in zip(lost, moved, strict=True):
+        files[row] = file
     outside = [row for row in lost if direct[row] is None]
     if outside and not any(files[row] for row in outside):
         name, where = named[outside[0]]
@@ -87,27 +82,42 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
             f"{root}: has no image with a pose; {len(named)} are named and missing, such as {named[0][0][-60:]!r}. Put "
             f"them there. {_GIVE_ELSE}"
         )
-    absent = (path or root.joinpath(*_parts(name)[-1:]) for path, (name, _) in zip(direct, named, strict=True))
-    every = tuple(file or path for file, path in zip(files, absent, strict=True))
-    if not moved:
-        return Found(every)
-    name, place = named[moved[0]][0], every[moved[0]].relative_to(root).as_posix()
-    return Found(every, f"{len(moved)} of {len(named)} by the ends of their paths: {name[-60:]!r} is {place}")
+    absent = {row: direct[row] or root / _parts(named[row][0])[-1] for row in lost if files[row] is None}
+    every = tuple(file or absent[row] for row, file in enumerate(files))
+    return Found(every, frozenset(absent.values()), _said(root, named, every, [row for row in lost if files[row]]))
 
 
-def _direct(root: Path, name: Any, where: str) -> Path | None:
-    """The path that a name means below the root; None where it leads out.
+def _by_tails(
+    root: Path, lost: Sequence[tuple[Any, str]], taken: set[Path], named: Sequence[tuple[Any, str]]
+) -> list[Path | None]:
+    """The picture of each path that is not where it says, if one below the root has its end and no other path.
 
     Raises:
-        InputError: for a name that no file can have.
+        InputError: for a path that no file has, or that may mean two pictures.
     """
-    longest = "" if not isinstance(name, str) else "/".join(_parts(name))
+    for name, where in lost:
+        if not isinstance(name, str) or not _is_possible(root, name):
+            raise InputError(
+                f"{where}: names {str(name)[:60]!r}, which is no file inside of {root}; write the picture's path there"
+            )
+    tails, least = _Tails(root), 1 if len({_parts(name)[:-1] for name, _ in named}) == 1 else 2
+    found = [tails.find(_parts(name), least, name, where) for name, where in lost]
+    return [None if file in taken else file for file in found]
+
+
+def _is_possible(root: Path, name: str) -> bool:
+    """Whether a file may have the name of a path, with a suffix if it lacks one."""
+    longest = "/".join(_parts(name))
     longest += max(map(len, PICTURES)) * "_" if longest and not _has_suffix(longest) else ""
-    if not isinstance(name, str) or path_inside(root, longest) is None:
-        raise InputError(
-            f"{where}: names {str(name)[:60]!r}, which is no file inside of {root}; write the picture's path there"
-        )
-    return path_inside(root, name)
+    return path_inside(root, longest) is not None
+
+
+def _said(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], moved: Sequence[int]) -> str:
+    """How pictures were found that are not where their names say."""
+    if not moved:
+        return ""
+    name, place = named[moved[0]][0], files[moved[0]].relative_to(root).as_posix()
+    return f"{len(moved)} of {len(named)} by the ends of their paths: {name[-60:]!r} is {place}"
 
 
 def _parts(name: str) -> Parts:
@@ -136,7 +146,8 @@ def _spelled(name: str) -> Iterator[str]:
     if _has_suffix(name):
         yield name
     else:
-        yield from (name + suffix for suffix in (*PICTURES, *map(str.upper, PICTURES)))
+        spelled = (name + suffix for suffix in (*PICTURES, *map(str.upper, PICTURES)))
+        yield from (each for each in spelled if len(each.encode()) <= _LONGEST_NAME)
 
 
 def _has_suffix(name: str) -> bool:

@@ -78,7 +78,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
     found = find_pictures(folder, [*named, *((name, where) for _, name, where in lists)])
     split_of = {file: split for file, (split, _, _) in zip(found.files[len(frames) :], lists, strict=True)}
     pairs = sorted(zip(found.files, frames, strict=False), key=lambda pair: (natural(pair[0].parent), natural(pair[0])))
-    there = [(image, frame) for image, frame in pairs if image.is_file()]
+    there = [(image, frame) for image, frame in pairs if image not in found.missing]
     good = [(image, frame) for image, frame in there if not frame.is_bad]
     cameras, names, decided = read_cameras(
         [frame.intrinsics for _, frame in good], [image for image, _ in good], files[0]
@@ -95,7 +95,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         unit="unknown",
         choices={**choices, "cameras": decided, **found.choices},
         cameras=cameras,
-        missing=[image.relative_to(folder).as_posix() for image, _ in pairs if not image.is_file()],
+        missing=[image.relative_to(folder).as_posix() for image, _ in pairs if image in found.missing],
         beside=pictures_beside(image for image, _ in pairs),
         left_out={image: _BAD for image, frame in there if frame.is_bad},
     )

@@ -123,8 +123,8 @@ HEADER = "image,x,y,z,qw,qx,qy,qz\n"
         (HEADER + ROW + "a.jpg,0,0\n", "line 3: has 3 fields where the first line names 8"),
         (HEADER + ROW.replace("1", "one"), "line 2: x,y,z,qw,qx,qy,qz must be numbers"),
         (HEADER + ROW.replace("1", "0.1"), "line 2: the quaternion is far from unit length"),
-        (HEADER + ROW.replace("a.jpg", "../a.jpg"), "line 2: names '../a.jpg', which is no file inside of"),
-        (HEADER + ROW.replace("a.jpg", "/a.jpg"), "line 2: names '/a.jpg', which is no file inside of"),
+        (HEADER + ROW.replace("a.jpg", "../b.jpg"), "line 2: names '../b.jpg', which is no file inside of"),
+        (HEADER + ROW.replace("a.jpg", "/b.jpg"), "line 2: names '/b.jpg', which is no file inside of"),
         (HEADER + ROW.replace("a.jpg", ""), "line 2: names '', which is no file inside of"),
         (HEADER + ROW, "has no image with a pose"),
         (
