@@ -124,8 +124,8 @@ def uses_16_bits(pixels: NDArray[Any]) -> bool:
 def stretched(pixels: NDArray[Any], counts: Counts) -> Image:
     """Eight bits of 16, from black to white; counts beyond are cut off."""
     black, white = counts
-    scaled = (pixels.astype(np.float32) - black) * np.float32(255 / (white - black))
-    return scaled.round().clip(0, 255).astype(np.uint8)
+    grey = (np.arange(FULL_COUNTS[1] + 1) - black) * 255 / (white - black)
+    return grey.round().clip(0, 255).astype(np.uint8)[pixels]
 
 
 def _brand(data: bytes) -> bytes:
