@@ -72,6 +72,7 @@ class Capture:
         split: N of ``train``, ``val``, ``test`` where the format tells of them.
         poses_without_image: what the format names and is not there.
         images_without_pose: images beside those used.
+        left_out: why frames are left out that the format itself marks as bad, by file.
         depth: of the images, where the format has it and the images are those of a pinhole.
         tracks: points that the format says the images see.
         world: where positions lie in the source's world.
@@ -89,6 +90,7 @@ class Capture:
     split: tuple[str, ...] | None = None
     poses_without_image: tuple[str, ...] = ()
     images_without_pose: tuple[Path, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
     depth: Depth | None = None
     tracks: Tracks | None = None
     world: World = field(default_factory=World)

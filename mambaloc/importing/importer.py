@@ -34,6 +34,7 @@ def import_scene(
     split: str = "auto",
     command: str = "",
     with_adjusted: bool = False,
+    images: Path | None = None,
 ) -> Imported:
     """Read a capture, check it, split it, and write it as a scene's folder, which appears once it is whole.
 
@@ -45,6 +46,7 @@ def import_scene(
         split: of :data:`~mambaloc.importing.splits.selection.ASKED`.
         command: that this was asked for with.
         with_adjusted: also write poses that are adjusted to the pictures, in a file of their own.
+        images: the folder of the capture's images, where its format names them by paths; found unless given.
 
     Raises:
         InputError: for a source that is none, a folder that is there or cannot be written, or a split that cannot be
@@ -58,10 +60,12 @@ def import_scene(
         raise InputError(
             f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
         )
-    capture, left_out = in_its_world(read_capture(source, kind), metres_per_unit)
+    capture = read_capture(source, kind, images)
+    named = capture.left_out
+    capture, lost = in_its_world(capture, metres_per_unit)
     with whole_folder(out, "choose another folder with --out") as partial:
         written = write_pictures(capture, partial)
-        imported = _checked(written, {**left_out, **written.rules}, split, with_adjusted)
+        imported = _checked(written, {**named, **lost, **written.rules}, split, with_adjusted)
         write_frames(imported, partial)
         if imported.capture.tracks:
             imported.capture.tracks.write(partial)

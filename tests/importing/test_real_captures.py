@@ -35,7 +35,7 @@ def test_bad_frames_are_left_out_and_named(rendered, tmp_path):
     assert {Path(file).name: rule for file, rule in imported.left_out.items()} == {
         "0004.png": "no fix: the pose is NaN, infinite or all zeros",
         "0008.png": "image is truncated",
-        "0011.png": "image is 50x30, its camera's 160x120",
+        "0011.png": "image is 50x30, of another shape than its camera's 160x120",
     }
     said = told(tmp_path / "a")
     assert said["frames"]["used"] == 37
@@ -107,7 +107,7 @@ def test_a_photograph_with_exif_is_turned_as_its_camera_has_it(rendered_once, tm
     (tmp_path / "a.jpg").write_bytes(jpeg[:2] + segment + jpeg[2:])
     camera = Camera(*size, (140.0, 140.0), (size[0] / 2, size[1] / 2))
     capture = replace(capture, images=(tmp_path / "a.jpg",), cameras={"camera-1": camera})
-    written, sizes, rules, _ = write_pictures(capture, tmp_path / "out")
+    written, sizes, rules, *_ = write_pictures(capture, tmp_path / "out")
     assert rules == {}
     assert sizes == [size]
     expected = stored if size == SIZE else np.rot90(stored, k=-1)

@@ -43,6 +43,7 @@ def build_capture(
     cameras: Mapping[str, Camera] | None = None,
     missing: Sequence[str] = (),
     beside: Iterable[Path] = (),
+    left_out: Mapping[Path, str] | None = None,
     depth_camera: Matrices | None = None,
 ) -> Capture:
     """Make a capture: sequence after sequence, in the order of their first images.
@@ -56,11 +57,17 @@ def build_capture(
         cameras: by name.
         missing: images that the format names and that are not there.
         beside: images that are there, of which some may be among ``posed``.
+        left_out: why images are left out that the format marks as bad.
         depth_camera: (3, 3), in pixels of depth frames, which are in millimetres.
 
     Raises:
         InputError: for no image, one with two poses, or more than a scene may have.
     """
+    marked = left_out or {}
+    if not posed and marked:
+        raise InputError(
+            f"{source}: all {len(marked)} images with a pose are {next(iter(marked.values()))}; mark fewer"
+        )
     if not posed:
         named = f"; {len(missing)} are named and missing, such as {missing[0]!r}" if missing else ""
         raise InputError(f"{source}: has no image with a pose{named}; add them")
@@ -71,6 +78,7 @@ def build_capture(
         if each.image in used:
             raise InputError(f"{source}: gives {each.image} more than one pose; remove all but one")
         used.add(each.image)
+    known = {*used, *marked}
     rank = {name: at for at, name in enumerate(dict.fromkeys(each.sequence for each in posed))}
     ordered = sorted(posed, key=lambda each: rank[each.sequence])
     cameras_of = [each.camera for each in ordered if each.camera is not None]
@@ -88,7 +96,8 @@ def build_capture(
         time_s=np.array(times) if len(times) == len(ordered) else None,
         split=tuple(splits) if len(splits) == len(ordered) and set(splits) != {"unused"} else None,
         poses_without_image=tuple(missing),
-        images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in used),
+        images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in known),
+        left_out={str(image): rule for image, rule in marked.items()},
         depth=None if depth_camera is None else Depth(tuple(each.depth for each in ordered), depth_camera),
     )
 
