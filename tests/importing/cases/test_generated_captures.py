@@ -12,7 +12,7 @@ import pytest
 
 sys.path.append(str(Path(__file__).parents[3] / "tools" / "benchmarks"))
 
-from captures import count_one
+from captures_read import count_one
 from captures_written import KINDS
 
 
