@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mambaloc.data.cameras import frame_intrinsics
-from mambaloc.data.datasets.capture import is_captured
+from mambaloc.data.datasets.capture import is_captured, world_of
 from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, Split
 from mambaloc.data.tracks import tracks_of_frames
@@ -33,6 +33,5 @@ def with_cameras(dataset: str, folder: Path, frames: Frames) -> PosedFrames:
     """
     intrinsics = frame_intrinsics(dataset, folder, frames)
     poses = rigid_transforms(matrix_from_quaternion(frames.quaternion), frames.position_m)
-    return PosedFrames(
-        frames.image_paths, intrinsics, poses, tracks_of_frames(folder, frames) if is_captured(folder) else None
-    )
+    tracks = tracks_of_frames(folder, frames) if is_captured(folder) else None
+    return PosedFrames(frames.image_paths, intrinsics, poses, tracks, world_of(folder))

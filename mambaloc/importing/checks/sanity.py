@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mambaloc.data.frames import FARTHEST, ROTATION_TOLERANCE
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.findings import Finding
-from mambaloc.importing.motion import Motion, quaternions
+from mambaloc.importing.motion import Motion, quaternions, sides_of
 from mambaloc.importing.undistort.decoding import Decoding
 from mambaloc.importing.undistort.fitting import is_same_shape
 from mambaloc.runtime.rotations import is_rotation
@@ -21,6 +21,7 @@ _DUPLICATE_SHARE = 1e-6  # of the extent
 _DUPLICATE_DEG = 1e-3
 _MANY = 0.1
 _NAMED = 3
+_MUCH = 2.0
 
 
 def bad_poses(world_from_cam: NDArray[np.float64]) -> dict[int, str]:
@@ -172,11 +173,17 @@ def check_duplicates(capture: Capture, motion: Motion) -> Finding:
 
 
 def check_extent(capture: Capture, motion: Motion, unit: str) -> Finding:
-    """Say how large the box around the camera centres is."""
+    """Say how large the box around nine tenths of the camera centres is, and around all where that is much larger."""
     position = capture.world_from_cam[:, :3, 3]
-    sides = np.ptp(position, axis=0)
-    said = f"{' x '.join(f'{side:.3g}' for side in sides)} {unit} along x, y, z"
-    figures = {"sides": sides.round(6).tolist(), "diagonal_of_nine_tenths": round(motion.extent, 6)}
+    sides, all_sides = sides_of(position), np.ptp(position, axis=0)
+    said = f"{' x '.join(f'{side:.3g}' for side in sides)} {unit} along x, y, z (nine tenths of the frames)"
+    if np.linalg.norm(all_sides) > _MUCH * np.linalg.norm(sides):
+        said += f"; of all frames {' x '.join(f'{side:.3g}' for side in all_sides)}"
+    figures = {
+        "sides": sides.round(6).tolist(),
+        "sides_of_all": all_sides.round(6).tolist(),
+        "diagonal_of_nine_tenths": round(motion.extent, 6),
+    }
     return Finding("extent", said, figures=figures)
 
 

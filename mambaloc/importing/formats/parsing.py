@@ -66,7 +66,7 @@ def read_lines(path: Path, holds: str) -> list[tuple[int, list[str]]]:
     return [(number, line.split()) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
-def read_table(path: Path, columns: int, row: str, named: bool = False) -> Table:
+def read_table(path: Path, columns: int, row: str, named: bool = False, may_lack_fix: bool = False) -> Table:
     """Read lines of so many finite numbers each.
 
     Args:
@@ -74,6 +74,7 @@ def read_table(path: Path, columns: int, row: str, named: bool = False) -> Table
         columns: numbers in a line.
         row: what a line is, for messages.
         named: whether a word comes before the numbers.
+        may_lack_fix: whether NaN and infinity are kept, which mark a pose without a fix.
 
     Raises:
         InputError: where it cannot be read, holds no line, or one of its lines is anything else.
@@ -82,7 +83,7 @@ def read_table(path: Path, columns: int, row: str, named: bool = False) -> Table
     numbers = np.empty((len(lines), columns))
     for at, (line, words) in enumerate(lines):
         values = as_numbers(words[int(named) :])
-        if values is None or len(values) != columns or not np.isfinite(values).all():
+        if values is None or len(values) != columns or not (may_lack_fix or np.isfinite(values).all()):
             raise InputError(f"{path}, line {line}: is no line {row!r} of finite numbers; correct or remove it")
         numbers[at] = values
     if not lines:
@@ -110,7 +111,9 @@ def read_object(path: Path, holds: str) -> dict[str, Any]:
     return value
 
 
-def array_of(value: Any, shape: tuple[int | None, ...], name: str, path: Path) -> NDArray[np.float64]:
+def array_of(
+    value: Any, shape: tuple[int | None, ...], name: str, path: Path, may_lack_fix: bool = False
+) -> NDArray[np.float64]:
     """Finite numbers of a JSON value.
 
     Args:
@@ -118,6 +121,7 @@ def array_of(value: Any, shape: tuple[int | None, ...], name: str, path: Path) -
         shape: what they must come in; None is any length.
         name: of the value, for messages.
         path: the file, likewise.
+        may_lack_fix: as of :func:`read_table`.
 
     Raises:
         InputError: for anything else.
@@ -127,7 +131,7 @@ def array_of(value: Any, shape: tuple[int | None, ...], name: str, path: Path) -
     except (TypeError, ValueError, OverflowError):  # no numbers, ragged, or larger than a float
         array = np.array(np.nan)
     fits = array.ndim == len(shape) and all(want in (None, is_) for want, is_ in zip(shape, array.shape, strict=True))
-    if not fits or not np.isfinite(array).all():
+    if not fits or not (may_lack_fix or np.isfinite(array).all()):
         size = " x ".join("N" if length is None else str(length) for length in shape) or "one"
         raise InputError(f"{path}: {name!r} must be {size} finite numbers; export it again")
     return array

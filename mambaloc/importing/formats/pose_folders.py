@@ -90,7 +90,7 @@ def read_replica(source: Path) -> Capture:
     Raises:
         InputError: for a file that is missing or damaged.
     """
-    table = read_table(source / "traj.txt", 16, _MATRIX)
+    table = read_table(source / "traj.txt", 16, _MATRIX, may_lack_fix=True)
     world_from_cam = validate_se3(table.numbers.reshape(-1, 4, 4), table.where)
     images = [image for image in pictures(source / "results") if image.name.startswith("frame")]
     numbered = {number_of(image): image for image in images}

@@ -27,6 +27,7 @@ from mambaloc.importing.formats.colmap import read_colmap
 from mambaloc.importing.formats.parsing import first_with_pictures, folder_name
 from mambaloc.importing.sfm.frame_choice import choose_frames
 from mambaloc.importing.sfm.reconstruction import NEIGHBOURS, find_features, match_features, place_images, quiet_colmap
+from mambaloc.importing.sfm.unread import pose_like, warning_of
 from mambaloc.importing.undistort.decoding import choices_of, counts_of
 from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
 from mambaloc.user_cache import made_once
@@ -65,6 +66,10 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
         InputError: without pycolmap, where the source cannot be read, or too few frames could be placed.
     """
     import_pycolmap(source)
+    unread = pose_like(source)
+    if unread:
+        console = Console(stderr=True, highlight=False)
+        console.print(f"{source}: {warning_of(unread)}", markup=False, soft_wrap=True)
     source = source if source.is_file() else first_with_pictures([source, source / "images"])
     folder = made_once(f"structure/{_digest(source, seed)}", lambda partial: _make(source, partial, threads, seed))
     note = json.loads((folder / "note.json").read_text(encoding="utf-8"))
@@ -72,6 +77,7 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
     placed = set(capture.images)
     name = source.stem if source.is_file() else folder_name(source)
     kept = {"direction": "camera-to-world", "model": f"{folder.parent.name}/{folder.name} of the cache"}
+    kept |= {"not read": warning_of(unread)} if unread else {}
     return replace(
         capture,
         kind="structure_from_motion",

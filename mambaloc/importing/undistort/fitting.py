@@ -1,8 +1,8 @@
 """The camera rule of all formats: a camera is judged by its own pictures.
 
-A picture of its camera's shape and another size was resized with all it shows: its camera scales with it. Pictures whose
-sizes differ by a few percent, as COLMAP's undistorter leaves them, are cropped to one size, and their principal points
-move with the corner. A picture of any other shape was cropped where nothing says: no camera is right for it.
+A picture of its camera's shape and another size was resized with all it shows: its camera scales with it. Pictures
+whose sizes differ by a few percent, as COLMAP's undistorter leaves them, are cropped to one size, and their principal
+points move with the corner. A picture of any other shape was cropped where nothing says: no camera is right for it.
 """
 
 from __future__ import annotations

@@ -81,12 +81,10 @@ def write_pictures(capture: Capture, folder: Path) -> Written:
 
 def _said(told: Mapping[str, Camera], lenses: Mapping[str, Camera], odd: int, count: int) -> dict[str, str]:
     """What was decided of pictures whose size is not their camera's, or not the others'."""
-    sizes = {(each.width, each.height) for each in lenses.values()} - {
-        (each.width, each.height) for each in told.values()
-    }
+    found, known = ({(each.width, each.height) for each in cameras.values()} for cameras in (lenses, told))
     said = {}
-    if sizes:
-        named = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)[:3])
+    if sizes := sorted(found - known):
+        named = ", ".join(map(_times, sizes[:3]))
         said["scaled cameras"] = f"to pictures of the same shape and another size than the capture says ({named})"
     if odd:
         said["cropped"] = f"{odd} of {count} pictures to the middle, so that sizes near each other are one"

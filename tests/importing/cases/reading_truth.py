@@ -1,9 +1,9 @@
-"""Captures that users had trouble with, ``../shared/cases/NAME``, and their true poses."""
+"""The true poses of a real case, and those of an imported scene, read without this library."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +11,43 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-CASES = Path(__file__).parents[4] / "shared" / "cases"
-
+CASES = Path(__file__).parents[3] / "../shared/cases"
 needs_cases = pytest.mark.skipif(not CASES.is_dir(), reason="needs ../shared/cases beside the repository")
 
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
-def truth_of(name: str) -> dict[str, NDArray[np.float64]]:
-    """``world_from_cam`` (4, 4) of each image by its name, OpenCV camera axes, as ``truth.txt`` has them."""
+
+def true_poses(file: Path) -> dict[str, NDArray[np.float64]]:
+    """``world_from_cam`` (4, 4) by picture, of lines ``image,x,y,z,qw,qx,qy,qz``."""
+    with file.open(newline="") as lines:
+        return {row["image"]: _matrix(row) for row in csv.DictReader(lines)}
+
+
+def scene_poses(scene: Path) -> dict[str, NDArray[np.float64]]:
+    """``world_from_cam`` (4, 4) of an imported scene in its source's world, by the picture's name without folders."""
+    world = json.loads((scene / "scene.json").read_text()).get("world", {})
     found = {}
-    with (CASES / name / "truth.txt").open() as file:
-        for row in csv.DictReader(file):
-            pose = np.eye(4)
-            pose[:3, 3] = [float(row[axis]) for axis in "xyz"]
-            pose[:3, :3] = Rotation.from_quat([float(row[f"q{each}"]) for each in "xyzw"]).as_matrix()
-            found[row["image"]] = pose
+    with (scene / "frames.csv").open(newline="") as lines:
+        for row in csv.DictReader(lines):
+            pose = _matrix(row)
+            pose[:3, 3] += world.get("offset_m", (0, 0, 0))
+            name = Path(row["image"]).name
+            assert name not in found
+            found[name] = pose
     return found
 
 
-def assert_true(name: str, images: Iterable[Path], world_from_cam: NDArray[np.float64], within: float = 1e-6) -> None:
-    """Check that images have their true poses, whose positions are written to a millionth."""
-    truth = truth_of(name)
-    for image, pose in zip(images, world_from_cam, strict=True):
-        np.testing.assert_allclose(pose, truth[image.name], rtol=0, atol=within, err_msg=image.name)
+def assert_true(
+    found: dict[str, NDArray[np.float64]], truth: dict[str, NDArray[np.float64]], atol: float = 2e-6
+) -> None:
+    """Whether each picture of the truth has its pose, and no other picture has one."""
+    assert set(found) == set(truth)
+    for name, pose in truth.items():
+        np.testing.assert_allclose(found[name], pose, atol=atol, err_msg=name)
+
+
+def _matrix(row: dict[str, str]) -> NDArray[np.float64]:
+    x, y, z, *xyzw = (float(row[name]) for name in POSE)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(xyzw).as_matrix(), (x, y, z)
+    return pose

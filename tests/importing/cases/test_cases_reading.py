@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from reading_truth import CASES, assert_true, needs_cases, truth_of
+from reading_truth import CASES, assert_true, needs_cases, scene_poses, true_poses
 from scipy.spatial.transform import Rotation
 
 from mambaloc.cli import main
 from mambaloc.data.datasets.seven_scenes import read_split
 from mambaloc.data.frames import BadFrames
-from mambaloc.errors import InputError
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import read_capture
 from mambaloc.runtime.sources import frames_of
@@ -35,7 +34,7 @@ def no_camera(monkeypatch):
 def test_exif_upside_down(tmp_path):
     capture = import_scene(CASES / "exif-upside-down/capture", tmp_path / "scene").capture
     assert len(capture.images) == 24
-    assert_true("exif-upside-down", capture.images, capture.world_from_cam)
+    assert_true(scene_poses(tmp_path / "scene"), true_poses(CASES / "exif-upside-down/truth.txt"))
     assert "as COLMAP reads them; 12 of 24" in capture.choices["pixels"]
     for image in capture.images:
         with Image.open(tmp_path / "scene" / image.relative_to(image.parents[2])) as copy:
@@ -69,7 +68,7 @@ def test_phone_heic_is_read_whole_with_the_extra(no_camera):
 def test_sixteen_bit(tmp_path):
     source = CASES / "sixteen-bit/capture"
     capture = import_scene(source, tmp_path / "scene").capture
-    assert_true("sixteen-bit", capture.images, capture.world_from_cam)
+    assert_true(scene_poses(tmp_path / "scene"), true_poses(CASES / "sixteen-bit/truth.txt"))
     counts = np.stack([np.asarray(Image.open(source / "images" / image.name)) for image in capture.images])
     seen = np.stack([np.asarray(Image.open(tmp_path / "scene/images/images" / image.name)) for image in capture.images])
     assert seen.shape == (24, 60, 80, 3)
@@ -164,9 +163,3 @@ def test_moved_run(tiny_recipe, tmp_path, monkeypatch):
     main([*resume, "last.ckpt"])
     for name in ("moved", "linked", "entered"):
         assert_best_of_all(tmp_path / name)
-
-
-def test_every_case_of_reading_has_its_truth():
-    assert {len(truth_of(name)) for name in ("exif-upside-down", "sixteen-bit")} == {24}
-    with pytest.raises(InputError, match="no such file"):
-        frames_of(CASES / "nothing")
