@@ -60,9 +60,13 @@ FORMATS: dict[str, Format] = {
     "scannet": Format("color/ and pose/", pose_folders.is_scannet, pose_folders.read_scannet),
     "replica": Format("traj.txt and results/", pose_folders.is_replica, pose_folders.read_replica),
     "colmap": Format("cameras, images and points3D", colmap.is_colmap, colmap.read_colmap, True),
-    "csv": Format("a .csv with columns image,x,y,z,qw,qx,qy,qz", csv_table.is_csv, csv_table.read_csv),
-    "csv_world_from_cam": Format("the same", _by_name_alone, partial(csv_table.read_csv, direction="world_from_cam")),
-    "csv_cam_from_world": Format("the same", _by_name_alone, partial(csv_table.read_csv, direction="cam_from_world")),
+    "csv": Format("a .csv with columns image,x,y,z,qw,qx,qy,qz", csv_table.is_csv, csv_table.read_csv, True),
+    "csv_world_from_cam": Format(
+        "the same", _by_name_alone, partial(csv_table.read_csv, direction="world_from_cam"), True
+    ),
+    "csv_cam_from_world": Format(
+        "the same", _by_name_alone, partial(csv_table.read_csv, direction="cam_from_world"), True
+    ),
     "tum": Format("a .tum or trajectory.txt beside images", tum.is_tum, tum.read_tum),
     "kitti_poses": Format("a .kitti or poses.txt beside images", kitti.is_kitti_poses, kitti.read_kitti_poses),
     "pose_lines": Format(

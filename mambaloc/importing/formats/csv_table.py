@@ -21,14 +21,15 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
+from mambaloc.files import path_inside
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
+from mambaloc.importing.formats.finding import Found, find_pictures
 from mambaloc.importing.formats.parsing import (
     as_numbers,
     first_with_pictures,
     folder_name,
-    inside,
     pictures_beside,
     read_text,
 )
@@ -76,12 +77,13 @@ def is_csv(source: Path) -> bool:
     return source.suffix.lower() == ".csv" or (source.is_dir() and any(source.glob("*.csv")))
 
 
-def read_csv(source: Path, direction: Direction | None = None) -> Capture:
+def read_csv(source: Path, direction: Direction | None = None, images: Path | None = None) -> Capture:
     """Read a table of one scene, whose image files lie by it.
 
     Args:
         source: the table, its folder, or a scene's folder beside a table of several.
         direction: of the quaternions; camera-to-world unless the table is of a scene whose labels are not.
+        images: the folder of the images; found by the table unless given.
 
     Raises:
         InputError: for a table that is damaged or can be read in more ways than one.
@@ -97,7 +99,7 @@ def read_csv(source: Path, direction: Direction | None = None) -> Capture:
         return f"{path}, line {rows[row][0]}"
 
     world_from_cam, mended = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), where)
-    pictured = _by_time(path, rows, columns) if columns.image is None else _by_image(path, rows, columns)
+    pictured = (_by_time if columns.image is None else _by_image)(path, rows, columns, images)
     posed = [
         Posed(image, sequence, world_from_cam[row], time_s=time_s, split=_split(path, *rows[row]))
         for image, sequence, row, time_s in pictured.frames
@@ -222,8 +224,9 @@ def _turned(quaternion: np.ndarray, direction: Direction | None) -> np.ndarray:
     return quaternion * (1, -1, -1, -1) if direction == "cam_from_world" else quaternion
 
 
-def _by_image(path: Path, rows: list[Row], columns: _Columns) -> _Pictured:
-    folder, images = _images(path, rows, columns)
+def _by_image(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> _Pictured:
+    folder, found = _images(path, rows, columns, given)
+    images, how = found.files, "; ".join(filter(None, ("by name", found.elsewhere)))
     stamps = None
     if columns.time is not None:
         stamps = stamps_of([row[columns.time] for _, row in rows])
@@ -238,11 +241,11 @@ def _by_image(path: Path, rows: list[Row], columns: _Columns) -> _Pictured:
             name = sequence if sequence not in ("", ".") else folder_name(folder)
             frames.append((image, name, place, None if stamps is None else float(stamps.seconds[place])))
     missing = [row[str(columns.image)] for (_, row), image in zip(rows, images, strict=True) if not image.is_file()]
-    return _Pictured(frames, "by name" if stamps is None else f"by name; timed in {stamps.unit}", missing)
+    return _Pictured(frames, how if stamps is None else f"{how}; timed in {stamps.unit}", missing)
 
 
-def _by_time(path: Path, rows: list[Row], columns: _Columns) -> _Pictured:
-    images = pictures(first_with_pictures([path.parent / name for name in IMAGE_FOLDERS]))
+def _by_time(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> _Pictured:
+    images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, [row[str(columns.time)] for _, row in rows], path)
     name = folder_name(path.parent)
     times_s = [None] * len(images) if pairing.time_s is None else pairing.time_s.tolist()
@@ -250,16 +253,21 @@ def _by_time(path: Path, rows: list[Row], columns: _Columns) -> _Pictured:
     return _Pictured(sorted(frames, key=lambda frame: frame[3] or 0.0), pairing.how, pairing.missing)
 
 
-def _images(path: Path, rows: list[Row], columns: _Columns) -> tuple[Path, list[Path]]:
+def _images(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> tuple[Path, Found]:
     """The folder that the table's names are relative to, and each row's file there."""
     names = [(row[str(columns.image)], row.get("scene", ""), f"{path}, line {line}") for line, row in rows]
-    root = path.parent
-    candidates = [
-        (root, [inside(root, name, where) for name, _, where in names]),
-        (root / "images", [inside(root / "images", name, where) for name, _, where in names]),
-        (root, [inside(root, name.removeprefix(f"{scene}/"), where) for name, scene, where in names]),
-    ]
-    return max(candidates, key=lambda candidate: sum(image.is_file() for image in candidate[1]))
+    whole = [(name, where) for name, _, where in names]
+    within = [(name.removeprefix(f"{scene}/"), where) for name, scene, where in names]
+    root = given or path.parent
+    candidates = [(root, whole), (root / "images", whole), (root, within)]
+    folder, named = max(candidates, key=lambda candidate: _count(*candidate))
+    return folder, find_pictures(folder, named)
+
+
+def _count(folder: Path, named: list[tuple[str, str]]) -> int:
+    """How many names are of files in a folder."""
+    paths = (path_inside(folder, name) for name, _ in named)
+    return sum(path is not None and path.is_file() for path in paths)
 
 
 def _split(path: Path, line: int, row: dict[str, str]) -> str | None:
