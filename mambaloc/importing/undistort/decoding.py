@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.exif import is_tiff, orientation_of
+from mambaloc.exif import head_of, is_tiff, orientation_of
 from mambaloc.images import Counts, Image, counts_between, decode_image, decode_pixels, histogram_of
 from mambaloc.importing.capture import Capture
 
@@ -30,7 +30,6 @@ _KNOWN = {
 }
 """Formats whose poses are known to mean stored pixels, and what reads these so."""
 
-_HEAD_BYTES = 1 << 17  # a JPEG's EXIF has at most half of it
 _SIDEWAYS = 5  # the first orientation that swaps width and height
 _ASKED = 5
 _SAMPLED = 100
@@ -118,13 +117,7 @@ def counts_of(paths: Sequence[Path]) -> Counts | None:
 
 def _orientation_and_depth(path: Path) -> tuple[int, bool]:
     """A picture's EXIF orientation, and whether it may have 16 bits; of one that cannot be read, neither."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-            if head.startswith(b"RIFF"):  # a WebP's EXIF is at its end
-                head += file.read()
-    except OSError:
-        return 1, False
+    head = head_of(path)
     return orientation_of(head), is_tiff(head) or (head.startswith(b"\x89PNG") and head[24:25] == b"\x10")
 
 

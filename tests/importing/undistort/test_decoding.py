@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
 from mambaloc.data.cache import cached_frames
-from mambaloc.data.frames import BadFrames
+from mambaloc.data.frames import BadFrames, Frames
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.checks.sanity import check_pixels
 from mambaloc.importing.undistort.decoding import counts_of, decoding_of
 from mambaloc.importing.undistort.pictures import write_pictures
+from mambaloc.mapping.posed import with_cameras
 
 KINDS = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP", "jpeg": "JPEG"}
 
@@ -87,10 +88,13 @@ def test_one_picture_that_lies_says_what_the_others_mean(tmp_path):
     assert written.capture.choices["pixels"] == "upright, as the cameras' sizes say: 2 of 2 were turned"
 
 
-def test_a_training_refuses_a_picture_that_may_be_either_way_round(tmp_path):
+def test_a_training_and_a_map_refuse_a_picture_that_may_be_either_way_round(tmp_path):
     images = [tagged(tmp_path, "a.jpg", (32, 24), 1), tagged(tmp_path, "b.jpg", (32, 24), 3)]
     with pytest.raises(InputError, match=r"b\.jpg: image has EXIF orientation 3"):
         cached_frames(images, 24, BadFrames(), tmp_path / "cache")
+    frames = Frames(tuple(images), ("one", "one"), np.zeros((2, 3)), np.eye(4)[[0, 0]])
+    with pytest.raises(InputError, match=r"b\.jpg: image has EXIF orientation 3"):
+        with_cameras("7scenes", tmp_path, frames)
 
 
 def deep(folder: Path, row: int, low: int, high: int, strays: int = 0) -> Path:
