@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mambaloc.text import decode_text, encoding_of_file, natural
+from mambaloc.text import decode_text, natural, open_text
 
 LINES = st.lists(st.text("abcz019.-_ äßéЖ語", max_size=30), min_size=1, max_size=20)
 MARKED = ("utf-8-sig", "utf-16", "utf-32")
@@ -38,7 +38,7 @@ def test_what_is_not_unicode_is_of_windows():
 def test_a_file_can_be_read_line_by_line(encoding, tmp_path):
     text = "ä" * 5000 + "\nb\n"  # the first bytes end within a character
     (tmp_path / "a.txt").write_bytes(text.encode(encoding))
-    with (tmp_path / "a.txt").open(encoding=encoding_of_file(tmp_path / "a.txt")) as file:
+    with open_text(tmp_path / "a.txt") as file:
         assert file.read() == text
 
 
