@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ _EXIF = b"Exif\0\0"
 _APP1, _SCAN, _END = 0xE1, 0xDA, 0xD9  # of a JPEG; EXIF and XMP are in APP1, and pixels follow the scan's head
 _ORIENTATION, _SHORT = 0x0112, 3
 _MOST_ENTRIES = 1000
+_HEAD_BYTES = 1 << 17  # a JPEG's EXIF has at most half of it
 
 _TURNS: dict[int, Callable[[Pixels], Pixels]] = {
     2: np.fliplr,
@@ -48,6 +50,26 @@ def orientation_of(data: bytes) -> int:
         if exif.startswith((_EXIF, *_TIFF)):  # XMP is in APP1, too
             return _in_tiff(exif.removeprefix(_EXIF))
     return 1
+
+
+def head_of(path: Path) -> bytes:
+    """The first bytes of a picture's file, which hold its orientation; none where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            return head + file.read() if head.startswith(b"RIFF") else head  # a WebP's EXIF is at its end
+    except OSError:
+        return b""
+
+
+def unclear_pose(head: bytes) -> str | None:
+    """The rule that a posed picture breaks where an orientation leaves open which of its pixels the pose means."""
+    if (orientation := orientation_of(head)) == 1:
+        return None
+    return (
+        f"image has EXIF orientation {orientation}, so its pose may mean stored or upright pixels. "
+        "Write it upright without one, or import the capture again."
+    )
 
 
 def is_tiff(data: bytes) -> bool:

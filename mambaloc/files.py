@@ -40,7 +40,7 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
     import yaml  # only here: exported models run without it
 
     try:
-        data = yaml.safe_load(decode_text(path.read_bytes()))
+        data = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
         if _expanded(data, {}) > _MOST_VALUES:
             raise InputError(f"{path}: its aliases stand for more than {_MOST_VALUES} values; write them out")
         return data

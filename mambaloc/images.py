@@ -41,7 +41,9 @@ END_BYTES = 4096
 FULL_COUNTS: Counts = (0, 65535)
 """Of a picture that uses the whole of its 16 bits, as photographs do."""
 
-_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+_STRAYS = 0.001  # of all pixels, at either end
+
+_AS_STORED = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _MARKERS = {b"\x89PNG": b"IEND", b"\xff\xd8\xff": b"\xff\xd9"}  # how a format starts, and how a whole file ends
 _STARTS = (*_MARKERS, b"BM", b"II*\0", b"MM\0*")
 _HEIF = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"mif2", b"msf1")
@@ -93,7 +95,7 @@ def decode_image(data: bytes, upright: bool = True, counts: Counts | None = None
     if pixels is None:
         return "image cannot be decoded"
     if pixels.dtype == np.uint16:
-        if counts is None and not uses_16_bits(pixels):
+        if counts is None and counts_between(histogram_of(pixels)) != FULL_COUNTS:
             return (
                 f"image has 16 bits and only counts from {pixels.min()} to {pixels.max()}. Say which counts are black "
                 "and white: import_scene.py finds them, localize.py takes --counts."
@@ -102,30 +104,40 @@ def decode_image(data: bytes, upright: bool = True, counts: Counts | None = None
     if pixels.dtype != np.uint8:
         return f"image has {pixels.dtype} numbers. Export it with 8 or 16 bits."
     if is_tiff(data):  # which OpenCV turns upright even where it is asked not to
-        image = pixels if upright else turned_back(pixels, orientation_of(data))
-    else:
-        image = turned(pixels, orientation_of(data)) if upright else pixels
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[return-value]
+        return pixels if upright else turned_back(pixels, orientation_of(data))
+    return turned(pixels, orientation_of(data)) if upright else pixels
 
 
 def decode_pixels(data: bytes) -> NDArray[Any] | None:
-    """Decode a file's bytes to BGR (H, W, 3) of the file's own depth; None where they cannot be."""
+    """Decode a file's bytes to RGB (H, W, 3) of the file's own depth; None where they cannot be."""
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), _AS_STORED) if data else None
     except cv2.error:  # a damaged header that asks for more than 2^30 pixels
         return None
 
 
-def uses_16_bits(pixels: NDArray[Any]) -> bool:
-    """Whether a 16-bit picture uses the upper half of its counts, as photographs do and thermal cameras do not."""
-    return float(np.mean(pixels > FULL_COUNTS[1] // 2)) > 0.001
+def counts_between(histogram: NDArray[np.int64]) -> Counts:
+    """Black and white of 16-bit pictures: what all but a few pixels lie between, or all 16 bits where that is most.
+
+    Args:
+        histogram: how many pixels have each of 65536 counts; not none.
+    """
+    share = np.cumsum(histogram) / histogram.sum()
+    black, white = np.searchsorted(share, (_STRAYS, 1 - _STRAYS)).tolist()
+    # Photographs use all 16 bits, and their 8 bits are the upper ones; thermal cameras use few.
+    return FULL_COUNTS if white - black > FULL_COUNTS[1] // 2 else (black, max(white, black + 1))
+
+
+def histogram_of(pixels: NDArray[Any]) -> NDArray[np.int64]:
+    """How many pixels, of all channels, have each of 65536 counts."""
+    return np.bincount(pixels.ravel(), minlength=FULL_COUNTS[1] + 1)
 
 
 def stretched(pixels: NDArray[Any], counts: Counts) -> Image:
     """Eight bits of 16, from black to white; counts beyond are cut off."""
     black, white = counts
-    scaled = (pixels.astype(np.float32) - black) * np.float32(255 / (white - black))
-    return scaled.round().clip(0, 255).astype(np.uint8)
+    grey = (np.arange(FULL_COUNTS[1] + 1) - black) * 255 / (white - black)
+    return grey.round().clip(0, 255).astype(np.uint8)[pixels]
 
 
 def _brand(data: bytes) -> bytes:

@@ -6,6 +6,7 @@ import codecs
 import re
 from decimal import Decimal
 from pathlib import Path, PurePath
+from typing import TextIO
 
 _MARKS = (  # a mark of UTF-32 begins like one of UTF-16
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -44,14 +45,20 @@ def decode_text(data: bytes) -> str:
     return data.decode(encoding_of(data), errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
-def encoding_of_file(path: Path) -> str:
-    """Encoding of a text file, from its first bytes, to read it line by line.
+def open_text(path: Path, newline: str | None = None, errors: str = "replace") -> TextIO:
+    """Open a text file of any usual encoding, which its first bytes tell, to read it line by line.
+
+    Args:
+        path: the file.
+        newline: as of :func:`open`.
+        errors: likewise, of what cannot be decoded.
 
     Raises:
         OSError: where it cannot be read.
     """
     with path.open("rb") as file:
-        return encoding_of(file.read(_HEAD_BYTES))
+        encoding = encoding_of(file.read(_HEAD_BYTES))
+    return path.open(encoding=encoding, errors=errors, newline=newline)
 
 
 def natural(path: PurePath) -> Key:

@@ -17,8 +17,9 @@ class WallClock(L.Callback):
     """Clock set-up, training and validation apart, and how long training took to reach a given error.
 
     Training seconds leave out set-up, validation, checkpoints and export. The clock survives a resume: a
-    checkpoint holds it, with ``history``: the medians of each validation and the training seconds before it. On an
-    accelerator it waits for the device before each reading.
+    checkpoint holds it, with ``history``: the medians of each validation and the training seconds before it, and with
+    ``began_at``: the time of day, in seconds, at which the first step began. On an accelerator it waits for the device
+    before each reading.
 
     Args:
         reach: validation medians, such as ``{"position_error_m": 0.2, "rotation_error_deg": 10}``; the training
@@ -30,21 +31,25 @@ class WallClock(L.Callback):
         self.seconds = {"setup_s": 0.0, "train_s": 0.0, "validation_s": 0.0}
         self.reached_s: float | None = None
         self.history: list[dict[str, float]] = []
+        self.began_at: float | None = None
         self._last = time.perf_counter()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the readings so far."""
-        return {**self.seconds, "reached_s": self.reached_s, "reach": dict(self.reach), "history": self.history}
+        readings = {"reached_s": self.reached_s, "history": self.history, "began_at": self.began_at}
+        return {**self.seconds, "reach": dict(self.reach), **readings}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from a checkpoint's readings, adding this process's own set-up."""
         self.seconds = {name: state_dict[name] for name in self.seconds}
         self.reached_s = state_dict["reached_s"]
-        self.history = list(state_dict.get("history", []))  # checkpoints before this had none
+        self.history = list(state_dict.get("history", []))  # older checkpoints have none
+        self.began_at = state_dict.get("began_at")
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """End set-up."""
         self._lap(pl_module, "setup_s")
+        self.began_at = self.began_at or time.time()
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Begin an epoch; what lay between epochs is nobody's."""

@@ -23,7 +23,7 @@ from rich.progress import track
 
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
-from mambaloc.exif import orientation_of
+from mambaloc.exif import unclear_pose
 from mambaloc.files import claim_space
 from mambaloc.images import center_cropped, decode_image, resized
 from mambaloc.user_cache import default_cache_dir, fingerprint
@@ -156,11 +156,8 @@ def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:
         data = path.read_bytes()
     except OSError:
         return "image cannot be read"
-    if (orientation := orientation_of(data)) != 1:
-        return (
-            f"image has EXIF orientation {orientation}, so its pose may mean stored or upright pixels. "
-            "Write it upright without one, or import the capture again."
-        )
+    if rule := unclear_pose(data):
+        return rule
     image = decode_image(data)
     if isinstance(image, str):
         return image

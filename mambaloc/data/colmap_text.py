@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import TextIO
 
 from mambaloc.errors import InputError
-from mambaloc.text import encoding_of_file
+from mambaloc.text import open_text
 
 _PICTURE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _BEFORE_NAME = 9  # words
@@ -113,20 +113,17 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Lines that are no comments, by their number from 1, without spaces around them."""
     with _opened(path) as file:
         number = 0
-        try:
-            while line := file.readline(_LONGEST_LINE):
-                number += 1
-                if len(line) == _LONGEST_LINE:
-                    raise InputError(f"{path}, line {number}: is longer than any picture's; export the model again")
-                if not line.startswith("#"):
-                    yield number, line.strip()
-        except UnicodeDecodeError:
-            raise InputError(f"{path}, line {number + 1}: is no text; save the file as UTF-8") from None
+        while line := file.readline(_LONGEST_LINE):
+            number += 1
+            if len(line) == _LONGEST_LINE:
+                raise InputError(f"{path}, line {number}: is longer than any picture's; export the model again")
+            if not line.startswith("#"):
+                yield number, line.strip()
 
 
 def _opened(path: Path) -> TextIO:
     """A text in any usual encoding, with whatever ends of lines."""
     try:
-        return path.open(encoding=encoding_of_file(path))
+        return open_text(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); export the model again") from None

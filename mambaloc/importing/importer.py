@@ -60,10 +60,12 @@ def import_scene(
         raise InputError(
             f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
         )
-    capture, left_out = in_its_world(read_capture(source, kind, images), metres_per_unit)
+    capture = read_capture(source, kind, images)
+    named = capture.left_out
+    capture, lost = in_its_world(capture, metres_per_unit)
     with whole_folder(out, "choose another folder with --out") as partial:
         written = write_pictures(capture, partial)
-        imported = _checked(written, {**capture.left_out, **left_out, **written.rules}, split, with_adjusted)
+        imported = _checked(written, {**named, **lost, **written.rules}, split, with_adjusted)
         write_frames(imported, partial)
         if imported.capture.tracks:
             imported.capture.tracks.write(partial)

@@ -29,7 +29,7 @@ def in_its_world(capture: Capture, metres_per_unit: float | None) -> tuple[Captu
     Returns:
         The capture, with its offset, and the rule that each frame that was left out breaks, by file.
     """
-    capture, lost = _without(capture, without_fix(capture.world_from_cam, capture.sequences))
+    capture, lost = _without(capture, without_fix(capture.world_from_cam, capture.sequences, capture.images))
     capture, broken = _without(capture, sanity.bad_poses(capture.world_from_cam))
     capture = _in_metres(capture, metres_per_unit)
     capture, strays = _without(capture, astray(capture.world_from_cam))

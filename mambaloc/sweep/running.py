@@ -81,9 +81,7 @@ def run_sweep(sweep: Sweep, out: Path, address: str | None = None, retry_failed:
                         _keep(store, progress, trial, outcome, done, failed)
                         continue
                     folder = run_folder(out, trial.key).absolute()
-                    args = trial.command(partial(run_folder, out.absolute()))
-                    command = (*TRAIN, *args, "--trainer.default_root_dir", str(folder))
-                    running[submit(command, folder, sweep.time_limit_s, sweep.cpus)] = trial
+                    running[submit(train_command(trial, out), folder, sweep.time_limit_s, sweep.cpus)] = trial
                     progress.started(trial)
                 for future in wait(running, return_when=FIRST_COMPLETED).done if running else ():
                     _keep(store, progress, running.pop(future), _outcome(future), done, failed)
@@ -93,6 +91,12 @@ def run_sweep(sweep: Sweep, out: Path, address: str | None = None, retry_failed:
 def run_folder(out: Path, key: str) -> Path:
     """Where a trial's training writes."""
     return out / "runs" / key[:12]
+
+
+def train_command(trial: Trial, out: Path) -> tuple[str, ...]:
+    """The command that trains in the trial's folder."""
+    folder_of = partial(run_folder, out.absolute())
+    return *TRAIN, *trial.command(folder_of), "--trainer.default_root_dir", str(folder_of(trial.key))
 
 
 def run_trial(command: tuple[str, ...], run: Path, time_limit_s: float, cpus: float) -> Outcome:

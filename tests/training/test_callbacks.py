@@ -22,6 +22,7 @@ def clock(monkeypatch):
     """A clock that a test moves by hand."""
     now = SimpleNamespace(s=100.0)
     monkeypatch.setattr(wall_clock.time, "perf_counter", lambda: now.s)
+    monkeypatch.setattr(wall_clock.time, "time", lambda: 1e9 + now.s)
     return now
 
 
@@ -50,6 +51,7 @@ def test_wall_clock_keeps_training_apart_and_survives_a_resume(clock):
         **{"setup_s": 7, "train_s": 10.5, "validation_s": 3},
         **{"reached_s": None, "reach": {"position_error_m": 0.2}},
         "history": [{"train_s": 10, "step": 40, "position_error_m": pytest.approx(0.3)}],
+        "began_at": 1e9 + 107,
     }
     second = WallClock(reach={"position_error_m": 0.2})
     second.load_state_dict(first.state_dict())
@@ -59,6 +61,7 @@ def test_wall_clock_keeps_training_apart_and_survives_a_resume(clock):
     epoch(second, trainer_at(0.1), clock, train_s=20, validation_s=1, afterwards_s=0)
     assert second.seconds == {"setup_s": 11, "train_s": 51.5, "validation_s": 5}
     assert second.reached_s == 30.5
+    assert second.began_at == 1e9 + 107, "of the first process"
     assert [reading["train_s"] for reading in second.history] == [10, 30.5, 51]
 
 

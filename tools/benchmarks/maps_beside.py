@@ -122,9 +122,15 @@ def _theirs(key: Pictures, queries: Pictures, work: Path, seed: int) -> Turn:
 
 
 def _score(pose: NDArray[Any] | None, cpu_s: float, truth: Floats) -> tuple[float, float, bool, float]:
+    return *errors_of_pose(pose, truth), False, cpu_s
+
+
+def errors_of_pose(pose: NDArray[Any] | None, truth: Floats) -> tuple[float, float]:
+    """Metres and degrees between two poses ``world_from_cam`` (4, 4); infinite where there is none."""
     if pose is None:
-        return np.inf, np.inf, False, cpu_s
-    return score(_Found(pose[:3, 3], quaternion_from_matrix(pose[:3, :3])), False, cpu_s, truth)
+        return np.inf, np.inf
+    position_m, rotation_deg, *_ = score(_Found(pose[:3, 3], quaternion_from_matrix(pose[:3, :3])), False, 0.0, truth)
+    return position_m, rotation_deg
 
 
 @dataclass(frozen=True)

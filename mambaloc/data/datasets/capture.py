@@ -21,7 +21,7 @@ from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
 from mambaloc.runtime.rotations import canonical
 from mambaloc.runtime.world import World
-from mambaloc.text import encoding_of_file
+from mambaloc.text import open_text
 
 CAPTURE = "capture"
 """Name of the dataset whose scenes ``tools/import_scene.py`` made, each named by its folder's path."""
@@ -159,7 +159,7 @@ def _usable(folder: Path) -> None:
 def _table(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Rows of a CSV file by column, each with its line."""
     try:
-        with path.open(newline="", encoding=encoding_of_file(path)) as file:
+        with open_text(path, newline="", errors="strict") as file:
             table = csv.reader(file, strict=True)
             header = next(table, [])
             if tuple(header) != COLUMNS:

@@ -7,30 +7,34 @@ begins; the frames around it tell.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
+from mambaloc.text import natural
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
 FARTHEST = 1e9
 """Largest coordinate that a pose may have in its source's own world."""
 
-_OUTSIDE = 10.0  # extents
+_OUTSIDE = 2.0  # extents
 _JUMP_STEPS, _JUMP_SHARE, _JUMP_DEG = 10.0, 0.02, 45.0
 _LONGEST_STEP = 0.25  # of the extent, on a path
 _ASTRAY = 1000.0  # extents
 _BLURRED = 1e4  # from the middle: float32 is off by a thousandth there
 
 
-def without_fix(world_from_cam: Floats, sequences: Sequence[str]) -> dict[int, str]:
+def without_fix(world_from_cam: Floats, sequences: Sequence[str], images: Sequence[Path]) -> dict[int, str]:
     """The reason why frames have no fix, by row.
 
     Args:
         world_from_cam: (N, 4, 4), in the source's world.
         sequences: N names of recordings.
+        images: N files, whose natural order is that in which they were taken, whatever order their poses come in.
     """
     position = world_from_cam[:, :3, 3]
     is_finite = np.isfinite(world_from_cam).all(axis=(1, 2))
@@ -40,8 +44,9 @@ def without_fix(world_from_cam: Floats, sequences: Sequence[str]) -> dict[int, s
     is_fixed = is_finite & ~is_far
     is_zero = is_fixed & (position == 0).all(axis=1)
     if is_zero.any() and (is_fixed & ~is_zero).sum() > 1:
-        marks = _marks(world_from_cam, np.array(sequences), is_zero, is_fixed & ~is_zero)
-        found |= dict.fromkeys(marks, "no fix: the position is 0 0 0, far from the frames around it")
+        order = np.array(sorted(range(len(images)), key=lambda row: (sequences[row], natural(images[row]))))
+        marks = _marks(world_from_cam[order], np.array(sequences)[order], is_zero[order], (is_fixed & ~is_zero)[order])
+        found |= dict.fromkeys(order[marks].tolist(), "no fix: the position is 0 0 0, far from the frames around it")
     return found
 
 
@@ -58,7 +63,7 @@ def astray(world_from_cam: Floats) -> dict[int, str]:
     }
 
 
-def _marks(world_from_cam: Floats, sequences: NDArray[np.str_], is_zero: Floats, is_fixed: Floats) -> list[int]:
+def _marks(world_from_cam: Floats, sequences: NDArray[np.str_], is_zero: Rows, is_fixed: Rows) -> list[int]:
     """Rows at exactly 0 0 0 that are marks: outside of the place, or where the camera cannot have gone."""
     zeros, fixed = np.flatnonzero(is_zero), np.flatnonzero(is_fixed)
     position = world_from_cam[fixed, :3, 3]
@@ -66,7 +71,8 @@ def _marks(world_from_cam: Floats, sequences: NDArray[np.str_], is_zero: Floats,
     extent = max(float(np.linalg.norm(high - low)), 1e-12)
     if np.linalg.norm(position, axis=1).min() > _OUTSIDE * extent:
         return zeros.tolist()
-    quaternion = quaternion_from_matrix(world_from_cam[:, :3, :3])
+    quaternion = np.full((len(world_from_cam), 4), np.nan)
+    quaternion[is_zero | is_fixed] = quaternion_from_matrix(world_from_cam[is_zero | is_fixed, :3, :3])
     later = 1 + np.flatnonzero(sequences[fixed][1:] == sequences[fixed][:-1])
     step = np.median(np.linalg.norm(position[later] - position[later - 1], axis=1)) if len(later) else np.inf
     if step > _LONGEST_STEP * extent:

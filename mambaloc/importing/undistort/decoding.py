@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.exif import is_tiff, orientation_of
-from mambaloc.images import FULL_COUNTS, Counts, Image, decode_image, decode_pixels
+from mambaloc.exif import head_of, is_tiff, orientation_of
+from mambaloc.images import Counts, Image, counts_between, decode_image, decode_pixels, histogram_of
 from mambaloc.importing.capture import Capture
 
 _KNOWN = {
@@ -30,11 +30,9 @@ _KNOWN = {
 }
 """Formats whose poses are known to mean stored pixels, and what reads these so."""
 
-_HEAD_BYTES = 1 << 17  # a JPEG's EXIF has at most half of it
 _SIDEWAYS = 5  # the first orientation that swaps width and height
 _ASKED = 5
 _SAMPLED = 100
-_STRAYS = 0.001  # of all pixels, at either end
 
 
 @dataclass(frozen=True)
@@ -112,25 +110,14 @@ def counts_of(paths: Sequence[Path]) -> Counts | None:
     """
     rows = np.unique(np.linspace(0, len(paths) - 1, min(_SAMPLED, len(paths))).round().astype(int)).tolist()
     with ThreadPoolExecutor() as pool:
-        found = [each for each in pool.map(_histogram, (paths[row] for row in rows)) if each is not None]
-    if not found:
-        return None
-    share = np.cumsum(np.sum(found, axis=0)) / np.sum(found)
-    if share[FULL_COUNTS[1] // 2] < 1 - _STRAYS:  # as photographs, whose 8 bits are the upper ones
-        return FULL_COUNTS
-    black, white = np.searchsorted(share, (_STRAYS, 1 - _STRAYS)).tolist()
-    return black, max(white, black + 1)
+        found = (each for each in pool.map(_histogram, (paths[row] for row in rows)) if each is not None)
+        total: NDArray[np.int64] = sum(found, histogram_of(np.zeros(0, np.int64)))
+    return counts_between(total) if total.any() else None
 
 
 def _orientation_and_depth(path: Path) -> tuple[int, bool]:
     """A picture's EXIF orientation, and whether it may have 16 bits; of one that cannot be read, neither."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-            if head.startswith(b"RIFF"):  # a WebP's EXIF is at its end
-                head += file.read()
-    except OSError:
-        return 1, False
+    head = head_of(path)
     return orientation_of(head), is_tiff(head) or (head.startswith(b"\x89PNG") and head[24:25] == b"\x10")
 
 
@@ -148,10 +135,11 @@ def _are_upright(capture: Capture, sideways: Sequence[int]) -> bool:
 
 
 def _histogram(path: Path) -> NDArray[np.int64] | None:
-    pixels: NDArray[Any] | None = decode_pixels(_bytes(path))
+    _, may_be_deep = _orientation_and_depth(path)
+    pixels: NDArray[Any] | None = decode_pixels(_bytes(path)) if may_be_deep else None
     if pixels is None or pixels.dtype != np.uint16:
         return None
-    return np.bincount(pixels.ravel(), minlength=FULL_COUNTS[1] + 1)
+    return histogram_of(pixels)
 
 
 def _bytes(path: Path) -> bytes:
