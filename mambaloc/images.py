@@ -56,11 +56,20 @@ def pictures(folder: Path) -> list[Path]:
     Raises:
         InputError: where it may not be read.
     """
+    return sorted(_pictures(folder), key=natural)
+
+
+def holds_pictures(folder: Path) -> bool:
+    """Whether :func:`pictures` finds any; it raises the same."""
+    return bool(_pictures(folder))
+
+
+def _pictures(folder: Path) -> list[Path]:
     try:
         files = list(folder.iterdir()) if folder.is_dir() else []
     except OSError as error:
         raise InputError(f"{folder}: cannot be read ({error.strerror}); make it readable") from None
-    return sorted((p for p in files if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural)
+    return [p for p in files if p.suffix.lower() in PICTURES and ".depth." not in p.name]
 
 
 def is_picture(path: Path) -> bool:

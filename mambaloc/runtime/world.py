@@ -40,7 +40,7 @@ class World:
         try:
             x, y, z = (float(each) for each in value["offset_m"])
             scale = float(value["metres_per_unit"])
-        except (TypeError, KeyError) as error:
+        except (TypeError, KeyError, ValueError) as error:
             raise ValueError(f"world: {type(error).__name__}: {error}") from None
         if not all(abs(each) <= _LARGEST for each in (x, y, z)) or not (math.isfinite(scale) and scale > 0):
             raise ValueError(f"world: {value}")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
-from mambaloc.images import PICTURES, pictures
+from mambaloc.images import PICTURES, holds_pictures, pictures
 from mambaloc.text import decode_text
 
 _MOST_BYTES = 1 << 26  # of a text: poses of a million images
@@ -166,7 +166,7 @@ def first_with_pictures(folders: Sequence[Path]) -> Path:
         InputError: where none does.
     """
     for folder in folders:
-        if pictures(folder):
+        if holds_pictures(folder):
             return folder
     names = ", ".join(str(folder) for folder in folders)
     raise InputError(f"{names}: none holds a picture ({', '.join(PICTURES)}); put the images there")

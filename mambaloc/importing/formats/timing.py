@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -216,10 +216,11 @@ def associated(first: NDArray[Any], second: NDArray[Any], farthest: float = FART
 def _by_name(images: Sequence[Path], words: Sequence[str]) -> tuple[list[tuple[int, int]], str, list[str]] | None:
     """Pair images with rows that name them; nothing where only some meet, by chance."""
     rows = {_plain(word): row for row, word in enumerate(words)}
-    are_counts = all(word.isdecimal() for word in words)  # then frame_0012.jpg is 12's
-    numbers = picture_words(images) if are_counts else [image.name for image in images]
-    names = [[_plain(image.name), _plain(number)] for image, number in zip(images, numbers, strict=True)]
-    found = [(i, rows[name]) for i, each in enumerate(names) if (name := next(filter(rows.__contains__, each), None))]
+    names = [_plain(image.name) for image in images]
+    if all(word.isdecimal() for word in words):  # then frame_0012.jpg is 12's
+        numbers = map(_plain, picture_words(images))
+        names = [name if name in rows else number for name, number in zip(names, numbers, strict=True)]
+    found = [(i, rows[name]) for i, name in enumerate(names) if name in rows]
     if len(found) not in (len(images), len(words)) or len({row for _, row in found}) < len(found):
         return None
     unused = sorted(set(range(len(words))) - {row for _, row in found})
@@ -228,8 +229,11 @@ def _by_name(images: Sequence[Path], words: Sequence[str]) -> tuple[list[tuple[i
 
 def _plain(name: str) -> str:
     """An image's name without folder and suffix, or the number that it is, however it is written."""
-    path = PurePosixPath(name)
-    stem = path.stem if path.suffix.lower() in PICTURES else path.name
+    file = name.rpartition("/")[2]
+    before, dot, suffix = file.rpartition(".")
+    stem = before if dot + suffix.lower() in PICTURES else file
+    if not stem[:1].isdigit():
+        return stem
     number = _number(stem)
     is_time = "." in stem.removesuffix(".0")  # 12.000 may be a second, and no frame's number
     if number is None or (is_time and number < _MOST_FRAMES):

@@ -96,10 +96,9 @@ def _trajectories(source: Path) -> list[Path]:
     """Files of time stamps and seven numbers; those of a trajectory's name where their lines tell nothing."""
     if source.is_file():
         return [source] if _is_trajectory(source, layout_of(source)) else []
-    layouts = pose_files(source)
     named = [source / name for name in _TRAJECTORIES] + (sorted(source.glob("*.tum")) if source.is_dir() else [])
-    known = [path for path in named if path.is_file()]
-    return known or [path for path, layout in layouts.items() if _is_trajectory(path, layout)]
+    known = [path for path in named if path.is_file() and _is_trajectory(path, layout_of(path))]
+    return known or [path for path, layout in pose_files(source).items() if _is_trajectory(path, layout)]
 
 
 def _is_trajectory(path: Path, layout: Layout | None) -> bool:
