@@ -84,25 +84,36 @@ def _pictures(path: Path) -> Iterator[tuple[int, list[str], str]]:
     lines = _lines(path)
     number, line = next(lines, (0, ""))
     while number:
+        if line and not _is_picture(line):
+            raise InputError(
+                f"{path}, line {number}: is no picture '{_PICTURE}', and no points 'X Y POINT3D_ID ...' of the picture "
+                "before it. Write two lines a picture, the second empty where it has no points."
+            )
         following = next(lines, (0, ""))
         if line:
-            words = line.split(maxsplit=_BEFORE_NAME)
-            if not _is_picture(line, words):
-                raise InputError(
-                    f"{path}, line {number}: is no picture '{_PICTURE}' and follows none whose points it may be. "
-                    "Write two lines a picture, the second empty where it has no points."
-                )
-            has_points = not _is_picture(following[1], following[1].split(maxsplit=_BEFORE_NAME))
-            yield number, words, following[1] if has_points else ""
+            has_points = not following[1] or _is_points(following[1].split())
+            yield number, line.split(maxsplit=_BEFORE_NAME), following[1] if has_points else ""
             following = next(lines, (0, "")) if has_points else following
         number, line = following
 
 
-def _is_picture(line: str, words: list[str]) -> bool:
-    """Whether a line is a picture's rather than one of points: numbers by the three, of which the last is whole."""
-    if len(words) <= _BEFORE_NAME or not (_is_whole(words[0]) and _is_whole(words[8])):
+def _is_picture(line: str) -> bool:
+    words = line.split(maxsplit=_BEFORE_NAME)
+    is_like = len(words) > _BEFORE_NAME and _is_whole(words[0]) and _is_whole(words[_BEFORE_NAME - 1])
+    return is_like and not _is_points(line.split())
+
+
+def _is_points(words: list[str]) -> bool:
+    """Whether a line is one of points, rather than of a picture whose name ends in a number."""
+    return len(words) % 3 == 0 and all(map(_is_whole, words[2::3])) and all(map(_is_number, words[: 2 * _BEFORE_NAME]))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
         return False
-    return not (_is_whole(line.rsplit(maxsplit=1)[-1]) and len(line.split()) % 3 == 0)
+    return True
 
 
 def _is_whole(word: str) -> bool:

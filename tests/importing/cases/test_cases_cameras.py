@@ -158,12 +158,13 @@ def test_a_model_written_by_hand(imported, kind):
     assert imported(f"colmap-by-hand/{kind}")["frames"]["used"] == 24
 
 
-def test_a_line_that_is_no_picture_is_named_with_the_rule(tmp_path):
-    shutil.copytree(CASES / "colmap-by-hand/no-points", tmp_path / "capture")
+@pytest.mark.parametrize("kind", ["no-points", "no-blank-lines"])
+def test_a_line_that_is_no_picture_is_named_with_the_rule(tmp_path, kind):
+    shutil.copytree(CASES / "colmap-by-hand" / kind, tmp_path / "capture")
     file = tmp_path / "capture/sparse/0/images.txt"
-    file.write_text(file.read_text() + "25 1 0 0 0 0 0 0 1\n")  # without its name
+    file.write_text(file.read_text() + "25 1 0.5 0 0 0 0 0 1\n")  # without its name
     with pytest.raises(
-        InputError, match=r"images\.txt, line 50: is no picture .* two lines a picture, the second empty"
+        InputError, match=r"images\.txt, line (50|26): is no picture .* two lines a picture, the second empty"
     ):
         read_capture(tmp_path / "capture")
 
