@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 from datetime import datetime
-from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import lightning as L
 import torch
@@ -21,6 +19,7 @@ from lightning.pytorch.plugins.environments import SLURMEnvironment
 from mambaloc.callbacks import (
     EarlyStopping,
     MapBuild,
+    MovedRun,
     OnnxExport,
     PoseProgressBar,
     TimeBudget,
@@ -36,27 +35,11 @@ from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint, measure_map_of_run, print_table
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.files import read_yaml, writing
-from mambaloc.models import Checkpoint, LitPoseRegressor, list_models
-from mambaloc.models.registry import model_class
+from mambaloc.models import Checkpoint, LitPoseRegressor
+from mambaloc.refusals import OneLineErrorParser, tell_refusals
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
 _SUBCOMMANDS = ("fit", "validate", "test", "predict")
-
-
-class OneLineErrorParser(LightningArgumentParser):
-    """Parser that answers a wrong option in one line, without its page of usage."""
-
-    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Raise what is wrong as an :class:`~mambaloc.errors.InputError`."""
-        chatter = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
-        lines = [line.strip() for line in str(message).splitlines()]
-        said = " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(chatter))
-        if unknown := re.search(r"Expected a dot import path string: (\w+)", said):
-            systems = [model_class(name).__name__ for name in list_models()]
-            near = get_close_matches(unknown[1], systems, n=3, cutoff=0.4) or systems
-            raise InputError(f"model.class_path {unknown[1]}: there is none; did you mean {', '.join(near)}?")
-        remedy = "; --help lists the options"  # a subcommand's parser reports to its parent, which reports again
-        raise InputError(said.replace("typing.", "").removesuffix(remedy) + remedy)
 
 
 class SaveRecipe(SaveConfigCallback):
@@ -121,6 +104,11 @@ class RecipeCLI(LightningCLI):
                 "trainer.enable_checkpointing false: a run ends with the errors of its checkpoints. Leave it out; "
                 "best_checkpoint.save_top_k 0 keeps the last one alone."
             )
+        if str(config.trainer.precision) in ("16-true", "bf16-true"):
+            raise InputError(
+                f"trainer.precision {config.trainer.precision}: pictures and poses have 32 bits, so weights must. "
+                f"Give {str(config.trainer.precision).replace('true', 'mixed')}."
+            )
         if config.data.validation == "none":
             config.best_checkpoint.save_top_k = 0
 
@@ -138,10 +126,10 @@ class RecipeCLI(LightningCLI):
         return trainer
 
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[L.Callback]) -> L.Trainer:
-        """Leave the progress bar out where the recipe switches it off; Lightning refuses to."""
+        """Leave the progress bar out where the recipe switches it off, which Lightning refuses; and find moved runs."""
         if config.get("enable_progress_bar") is False:
             callbacks = [each for each in callbacks if not isinstance(each, PoseProgressBar)]
-        return super()._instantiate_trainer(config, callbacks)
+        return super()._instantiate_trainer(config, [MovedRun(), *callbacks])
 
     def fit(self, model: L.LightningModule, **kwargs: Any) -> None:
         """Train; an interrupted run says how to go on.
@@ -194,8 +182,10 @@ def run_directory(config: Namespace) -> Path:
     """
     if os.environ.get("LOCAL_RANK", "0") != "0" and _RUN_DIR in os.environ:
         return Path(os.environ[_RUN_DIR])
-    checkpoint = Path(config.get("ckpt_path") or "")
-    if checkpoint.parent.name == "checkpoints":
+    given = Path(config.get("ckpt_path") or "")
+    paths = (given, given.absolute(), given.resolve())  # it may be given from its own folder, or by a link
+    checkpoint = next((path for path in paths if path.parent.name == "checkpoints"), None)
+    if checkpoint:
         run_dir = checkpoint.parent.parent
     elif config.trainer.default_root_dir:
         run_dir = Path(config.trainer.default_root_dir)
@@ -239,24 +229,26 @@ def recipe_arguments(argv: list[str]) -> list[str]:
 def main(argv: list[str] | None = None) -> RecipeCLI:
     """Run ``tools/train.py``."""
     quieten()
-    return RecipeCLI(
-        LitPoseRegressor,
-        PoseDataModule,
-        parser_class=OneLineErrorParser,
-        subclass_mode_model=True,
-        auto_configure_optimizers=False,
-        args=recipe_arguments(sys.argv[1:] if argv is None else argv),
-        seed_everything_default=0,
-        save_config_callback=SaveRecipe,
-        save_config_kwargs={"save_to_log_dir": False},
-        trainer_defaults={
-            "max_epochs": 600,  # the paper's cap
-            "num_sanity_val_steps": 0,
-            "log_every_n_steps": 1,
-            "enable_model_summary": False,
-        },
-        parser_kwargs={"parser_mode": "yaml"},
-    )
+    argv = sys.argv[1:] if argv is None else argv
+    with tell_refusals(argv):
+        return RecipeCLI(
+            LitPoseRegressor,
+            PoseDataModule,
+            parser_class=OneLineErrorParser,
+            subclass_mode_model=True,
+            auto_configure_optimizers=False,
+            args=recipe_arguments(argv),
+            seed_everything_default=0,
+            save_config_callback=SaveRecipe,
+            save_config_kwargs={"save_to_log_dir": False},
+            trainer_defaults={
+                "max_epochs": 600,  # the paper's cap
+                "num_sanity_val_steps": 0,
+                "log_every_n_steps": 1,
+                "enable_model_summary": False,
+            },
+            parser_kwargs={"parser_mode": "yaml"},
+        )
 
 
 __all__ = ["LitDistillation", "RecipeCLI", "main", "recipe_arguments"]

@@ -90,6 +90,14 @@ def pinhole_matrix(text: str) -> NDArray[np.float64]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
+def black_and_white(text: str) -> tuple[int, int]:
+    """Read an option's ``BLACK,WHITE``, counts of 16 bits, for :mod:`argparse`."""
+    black, comma, white = text.partition(",")
+    if not comma or not (black.isdecimal() and white.isdecimal()) or not int(black) < int(white) <= 65535:
+        raise argparse.ArgumentTypeError(f"{text}: give BLACK,WHITE, two counts from 0 to 65535, the smaller one first")
+    return int(black), int(white)
+
+
 def progress(items: Iterable[T], name: str, count: int) -> Iterable[T]:
     """Pass items on, with a bar in a terminal that goes away at the end."""
     from rich import get_console  # only here: exported models run without it

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from mambaloc.errors import InputError
+from mambaloc.text import decode_text
 
 _MOST_VALUES = 10**6
 _MOST_JSON_BYTES = 2**30
@@ -39,7 +40,7 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
     import yaml  # only here: exported models run without it
 
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
         if _expanded(data, {}) > _MOST_VALUES:
             raise InputError(f"{path}: its aliases stand for more than {_MOST_VALUES} values; write them out")
         return data
@@ -65,7 +66,7 @@ def read_json(path: Path, missing: str, broken: str) -> Any:
     try:
         if path.stat().st_size > _MOST_JSON_BYTES:
             raise InputError(f"{path}: is larger than {_MOST_JSON_BYTES} bytes; {broken}")
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(decode_text(path.read_bytes()))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError, and so is a number too long

@@ -21,6 +21,9 @@ def main() -> None:
     parser.add_argument("source", type=Path, help="the capture: a folder, or the file that lists its poses")
     parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the folder to make")
     parser.add_argument("--format", metavar="KIND", help=f"of {', '.join(FORMATS)}; found out unless given")
+    parser.add_argument(
+        "--images", type=Path, metavar="FOLDER", help="the capture's pictures, where they lie elsewhere"
+    )
     parser.add_argument("--metres-per-unit", type=float, metavar="X", help="the capture's unit, where it is known")
     parser.add_argument(
         "--split", default="auto", choices=ASKED, help="what to test on; the measured best unless given"
@@ -29,7 +32,7 @@ def main() -> None:
     args = parser.parse_args()
     command = shlex.join(["python", *sys.argv])
     imported = import_scene(
-        args.source, args.out, args.format, args.metres_per_unit, args.split, command, args.adjust_poses
+        args.source, args.out, args.format, args.metres_per_unit, args.split, command, args.adjust_poses, args.images
     )
     print_summary(imported, args.out)
     if not imported.verdict.is_usable:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, pinhole_matrix, thread_count
+from mambaloc.console import OptionParser, black_and_white, exits_cleanly, pinhole_matrix, thread_count
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.video import FILTERS, follow
 
@@ -26,6 +26,12 @@ def main() -> None:
         metavar="FX,FY,CX,CY",
         help="of the frames, in pixels; the training camera's unless given",
     )
+    parser.add_argument(
+        "--counts",
+        type=black_and_white,
+        metavar="BLACK,WHITE",
+        help="of 16-bit pictures, as the scene's report.md says; those that use all 16 bits need none",
+    )
     maps = parser.add_mutually_exclusive_group()
     maps.add_argument(
         "--map", dest="sparse_map", default=True, metavar="FILE", help="beside the model; a bundle's own unless given"
@@ -34,7 +40,7 @@ def main() -> None:
     parser.add_argument("--threads", type=thread_count, help="that the network may use for one image")
     args = parser.parse_args()
     localiser = Localiser(_model(args.model), args.threads, args.sparse_map)
-    print(f"{args.out}: {follow(localiser, args.source, args.out, args.filter, args.intrinsics)}")
+    print(f"{args.out}: {follow(localiser, args.source, args.out, args.filter, args.intrinsics, args.counts)}")
 
 
 def _model(name: str | None) -> Path:

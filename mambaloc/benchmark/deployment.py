@@ -127,7 +127,7 @@ def _latencies(calls: list[Callable[[], object]], repetitions: int) -> list[list
 def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict[str, _Form]:
     image = torch.rand(1, 3, *system.image_size, generator=torch.Generator().manual_seed(0))
     with TemporaryDirectory() as folder:
-        export_onnx(system, Path(folder, "model.onnx"), contract_of(system, data.hparams))
+        export_onnx(system, Path(folder, "model.onnx"), contract_of(system, data.hparams, world=data.world))
         exported = onnx.load(Path(folder, "model.onnx"))
     weights = io.BytesIO()
     torch.save(system.network.state_dict(), weights)

@@ -2,6 +2,7 @@
 
 from mambaloc.callbacks.early_stopping import EarlyStopping
 from mambaloc.callbacks.map_build import MapBuild
+from mambaloc.callbacks.moved_run import MovedRun
 from mambaloc.callbacks.onnx_export import OnnxExport
 from mambaloc.callbacks.progress import PoseProgressBar
 from mambaloc.callbacks.time_budget import TimeBudget
@@ -13,6 +14,7 @@ from mambaloc.callbacks.whole_checkpoints import WholeCheckpoints
 __all__ = [
     "EarlyStopping",
     "MapBuild",
+    "MovedRun",
     "OnnxExport",
     "PoseProgressBar",
     "TimeBudget",

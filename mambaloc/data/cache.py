@@ -23,11 +23,14 @@ from rich.progress import track
 
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
+from mambaloc.exif import unclear_pose
 from mambaloc.files import claim_space
-from mambaloc.images import decode_image, resized
+from mambaloc.images import center_cropped, decode_image, resized
 from mambaloc.user_cache import default_cache_dir, fingerprint
 
-_VERSION = 1
+_VERSION = 2
+
+Shape = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -38,15 +41,23 @@ class FrameCache:
         ``images`` (K, 3, H, W) uint8 RGB, read-only and memory-mapped; ``rows`` (K,), which image of the list each is:
         K is smaller than the list where bad images were left out.
 
-    ``key`` names what the images were and how they were resized.
+    ``sizes`` (K, 2) is the height and width of each once it was resized; of frames of several shapes, ``images`` has
+    the middle that all hold. ``key`` names what the images were and how they were resized.
     """
 
     images: NDArray[np.uint8]
     rows: NDArray[np.int64]
     key: str
+    sizes: NDArray[np.int64]
 
 
-def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_dir: Path | None = None) -> FrameCache:
+def cached_frames(
+    paths: Sequence[Path],
+    short_side: int,
+    bad: BadFrames,
+    cache_dir: Path | None = None,
+    least: tuple[int, int] | None = None,
+) -> FrameCache:
     """Open the cache of some images, building it first where there is none.
 
     Args:
@@ -54,18 +65,20 @@ def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_
         short_side: height or width, whichever is smaller, in pixels, that images are resized to.
         bad: what to do with an image that is missing, truncated, or of another shape than the first.
         cache_dir: where caches are kept.
+        least: of frames of several shapes the middle that all hold is kept, if it has this height and width; unless
+            given, another shape than the first is bad.
 
     Raises:
         InputError: for a bad image where ``bad`` says so, no good image at all, or a full disk.
     """
     root = (cache_dir or default_cache_dir()) / "frames"
-    folder = root / _key(paths, short_side)
+    folder = root / _key(paths, short_side, least)
     if not folder.is_dir():
         try:
             root.mkdir(parents=True, exist_ok=True)
             with FileLock(folder.with_suffix(".lock")):
                 if not folder.is_dir():  # another process may have built it meanwhile
-                    _build(folder, paths, short_side)
+                    _build(folder, paths, short_side, least)
         except OSError as error:
             message = f"{root}: the frame cache cannot be written ({error}); set MAMBALOC_CACHE elsewhere"
             raise InputError(message) from None
@@ -75,11 +88,12 @@ def cached_frames(paths: Sequence[Path], short_side: int, bad: BadFrames, cache_
     if not meta["rows"]:
         raise InputError(f"{paths[0].parent}: none of {len(paths)} images can be used")
     rows = np.array(meta["rows"], dtype=np.int64)
-    return FrameCache(np.load(folder / "images.npy", mmap_mode="r")[: len(rows)], rows, folder.name)
+    images = np.load(folder / "images.npy", mmap_mode="r")[: len(rows)]
+    return FrameCache(images, rows, folder.name, np.array(meta["sizes"], dtype=np.int64))
 
 
-def _key(paths: Sequence[Path], short_side: int) -> str:
-    digest = hashlib.sha256(f"{_VERSION} {short_side}".encode())
+def _key(paths: Sequence[Path], short_side: int, least: tuple[int, int] | None) -> str:
+    digest = hashlib.sha256(f"{_VERSION} {short_side} {least}".encode())
     with ThreadPoolExecutor() as pool:
         for path, content in zip(paths, pool.map(fingerprint, paths), strict=True):
             digest.update(f"{path.parent.name}/{path.name}\0".encode())
@@ -87,12 +101,29 @@ def _key(paths: Sequence[Path], short_side: int) -> str:
     return digest.hexdigest()[:32]
 
 
-def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:
+def _build(folder: Path, paths: Sequence[Path], short_side: int, least: tuple[int, int] | None) -> None:
     partial = folder.with_suffix(".partial")  # only this process has it: the lock is held
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
+    held: Shape | None = None
+    meta: dict[str, Any] | None = None
+    while meta is None:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        meta, held = _fill(partial / "images.npy", paths, short_side, held, least)
+    (partial / "meta.json").write_text(json.dumps({**meta, "short_side": short_side}))
+    partial.replace(folder)
+
+
+def _fill(
+    file: Path, paths: Sequence[Path], short_side: int, held: Shape | None, least: tuple[int, int] | None
+) -> tuple[dict[str, Any] | None, Shape | None]:
+    """Decode frames into a file, each cropped to a shape that all hold: the first one's unless given.
+
+    Returns:
+        What is to be known of them; or None and a smaller shape to begin again with.
+    """
     images: np.memmap[Any, np.dtype[np.uint8]] | None = None
     rows: list[int] = []
+    sizes: list[Shape] = []
     bad: list[tuple[int, str]] = []
     with ThreadPoolExecutor() as pool:
         decoded = pool.map(lambda path: _decode(path, short_side), paths)
@@ -101,19 +132,22 @@ def _build(folder: Path, paths: Sequence[Path], short_side: int) -> None:
                 bad.append((row, frame))
                 continue
             if images is None:
-                images = np.lib.format.open_memmap(
-                    partial / "images.npy", mode="w+", dtype=np.uint8, shape=(len(paths), *frame.shape)
-                )
-                claim_space(partial / "images.npy")
-            if frame.shape != images.shape[1:]:
+                held = held or frame.shape
+                images = np.lib.format.open_memmap(file, mode="w+", dtype=np.uint8, shape=(len(paths), *held))
+                claim_space(file)
+            common = tuple(map(min, frame.shape, images.shape[1:]))
+            if frame.shape != images.shape[1:] and (least is None or common[1] < least[0] or common[2] < least[1]):
                 bad.append((row, f"image is {_size(frame)} after resizing, where the first is {_size(images[0])}"))
                 continue
-            images[len(rows)] = frame
+            if common != images.shape[1:]:
+                pool.shutdown(cancel_futures=True)
+                return None, common
+            images[len(rows)] = center_cropped(frame.transpose(1, 2, 0), common[1:]).transpose(2, 0, 1)
             rows.append(row)
+            sizes.append(frame.shape[1:])
     if images is not None:
         images.flush()
-    (partial / "meta.json").write_text(json.dumps({"rows": rows, "bad": bad, "short_side": short_side}))
-    partial.replace(folder)
+    return {"rows": rows, "bad": bad, "sizes": sizes}, held
 
 
 def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:
@@ -122,6 +156,8 @@ def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:
         data = path.read_bytes()
     except OSError:
         return "image cannot be read"
+    if rule := unclear_pose(data):
+        return rule
     image = decode_image(data)
     if isinstance(image, str):
         return image

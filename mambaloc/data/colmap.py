@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mambaloc.data.colmap_text import count_images, readable
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX
 
@@ -25,12 +26,34 @@ _RECORDS = {
 _SENSOR, _POSE = 8, 56  # bytes, of a record in rigs.bin
 
 
-def colmap_folder(folder: Path, places: Sequence[str] = COLMAP_FOLDERS) -> Path | None:
-    """The folder of a scene's COLMAP model, if it has one."""
-    for model in (folder / place for place in places):
-        if any((model / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return model
-    return None
+def colmap_models(folder: Path, roots: Sequence[str] = ("sparse",)) -> list[Path]:
+    """The folders of a scene's COLMAP models, the one with most images first.
+
+    COLMAP leaves as many as it finds groups of images that it cannot connect, and the first need not be the largest.
+
+    Args:
+        folder: the scene's.
+        roots: where models lie, themselves or in numbered folders; the first that has any is looked at.
+    """
+    for root in roots:
+        numbered = sorted((path for path in (folder / root).glob("*") if path.name.isdecimal()), key=_by_number)
+        found = [model for model in (*numbered, folder / root) if _has_images(model)]
+        if found:
+            return sorted(found, key=count_images, reverse=True) if len(found) > 1 else found
+    return []
+
+
+def colmap_folder(folder: Path) -> Path | None:
+    """The folder of a scene's COLMAP model, the fullest of several, if it has one."""
+    return next(iter(colmap_models(folder)), None)
+
+
+def _by_number(path: Path) -> int:
+    return int(path.name[:18])
+
+
+def _has_images(model: Path) -> bool:
+    return any((model / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
 def load_colmap(path: Path) -> Any:
@@ -43,13 +66,17 @@ def load_colmap(path: Path) -> Any:
     for name in ("images.bin", "points3D.bin", "frames.bin", "rigs.bin"):
         if (path / name).is_file() and not _is_whole(name, (path / name).read_bytes()):
             raise InputError(f"{path / name}: is cut off or counts more than it holds; export the model again")
-    try:
-        model = pycolmap.Reconstruction(path)
-        [image.name for image in model.images.values()]  # each must be UTF-8
-    except Exception as error:  # whatever COLMAP's C++ throws at a damaged file
-        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
-        message = f"{path}: is no COLMAP model that pycolmap can read ({reason[0][:200]}); export it again or remove it"
-        raise InputError(message) from None
+    with readable(path) as (folder, names):
+        try:
+            model = pycolmap.Reconstruction(folder)
+            for number, name in names.items():
+                model.images[number].name = name
+            [image.name for image in model.images.values()]  # each must be UTF-8
+        except Exception as error:  # whatever COLMAP's C++ throws at a damaged file
+            lines = str(error).strip().splitlines()[-1:] or [type(error).__name__]
+            reason = lines[0].replace(str(folder), str(path))[:200]
+            message = f"{path}: is no COLMAP model that pycolmap can read ({reason}); export it again or remove it"
+            raise InputError(message) from None
     cameras, read = path / "cameras.bin", 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
     if cameras.is_file() and cameras.stat().st_size < read:  # COLMAP fills up what is missing
         raise InputError(f"{cameras}: is cut off or counts more than it holds; export the model again")

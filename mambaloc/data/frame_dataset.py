@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,11 +16,12 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mambaloc.data.cache import cached_frames
+from mambaloc.data.cameras import assumed_intrinsics
 from mambaloc.data.frames import BadFrames, Cameras, Frames
 from mambaloc.data.points import ScenePoints
 from mambaloc.errors import InputError
-from mambaloc.geometry import resized_intrinsics
-from mambaloc.images import resized_size
+from mambaloc.geometry import cropped_intrinsics, resized_intrinsics
+from mambaloc.images import center_corner, resized_size
 from mambaloc.types import PoseBatch
 
 
@@ -105,6 +106,7 @@ def load_split(
     short_side: int,
     crop: tuple[int, int],
     cache_dir: str | None,
+    is_mixed: bool = False,
 ) -> LoadedSplit:
     """Decode the images of posed frames, once.
 
@@ -115,12 +117,14 @@ def load_split(
         short_side: what the shorter side of every image is resized to, in pixels.
         crop: height and width that will be taken of it.
         cache_dir: where decoded frames are kept; the user's cache folder unless given.
+        is_mixed: images may be of several shapes, of which the middle that all hold is kept, and cameras are of that.
 
     Raises:
         InputError: as :func:`~mambaloc.data.cache.cached_frames`, for images that do not hold the crop, and for cameras
             of pictures of another shape.
     """
-    cache = cached_frames(frames.image_paths, short_side, bad, Path(cache_dir) if cache_dir else None)
+    folder = Path(cache_dir) if cache_dir else None
+    cache = cached_frames(frames.image_paths, short_side, bad, folder, crop if is_mixed else None)
     height, width = cache.images.shape[-2:]
     if crop[0] > height or crop[1] > width:
         raise InputError(
@@ -129,14 +133,30 @@ def load_split(
         )
     frames = frames.select(cache.rows)
     cameras = cameras_of(frames)
+    if is_mixed and cameras.is_assumed:
+        sizes_px = np.flip(cache.sizes, axis=1)
+        usual = np.stack([assumed_intrinsics((width, height)) for width, height in sizes_px.tolist()])
+        cameras = Cameras(usual, sizes_px.copy(), is_assumed=True)
     for row, (wide, high) in enumerate(cameras.size_px.tolist()):
-        if resized_size((high, wide), short_side) != (height, width):
+        if resized_size((high, wide), short_side) != tuple(cache.sizes[row].tolist()):
             raise InputError(
                 f"{frames.image_paths[row]}: has another shape than its camera's {wide}x{high} pixels. "
                 "Give the intrinsics of this picture."
             )
+    if (cache.sizes != (height, width)).any():
+        cameras = _of_middle(cameras, cache.sizes, (height, width))
     fingerprint = hashlib.sha256(f"{cache.key} {frames.digest()}".encode()).hexdigest()
     return LoadedSplit(CachedFrames(frames, cache.images, cameras), bad, fingerprint)
+
+
+def _of_middle(cameras: Cameras, sizes: NDArray[np.int64], crop: tuple[int, int]) -> Cameras:
+    """Cameras of the middle (height, width) of pictures that were resized to sizes (N, 2), likewise."""
+    size_px, resized = torch.from_numpy(cameras.size_px), torch.from_numpy(sizes).flip(1)
+    scale_x, scale_y = (resized / size_px).unbind(dim=1)
+    intrinsics = resized_intrinsics(torch.from_numpy(cameras.intrinsics), scale_x, scale_y)
+    corners = torch.tensor([center_corner(size, crop) for size in sizes.tolist()])
+    intrinsics = cropped_intrinsics(intrinsics, *corners.unbind(dim=1))
+    return replace(cameras, intrinsics=intrinsics.numpy(), size_px=np.tile(crop[::-1], (len(sizes), 1)))
 
 
 def describe_points(parts: Mapping[Any, LoadedSplit]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from rich.progress import track
 
 from mambaloc.data.frames import plain_name
 from mambaloc.errors import InputError
+from mambaloc.text import open_text
 
 NVM_FILE = "reconstruction.nvm"
 _LONGEST_LINE = 1 << 22  # characters; a track through 100,000 images is shorter
@@ -48,7 +49,7 @@ def read_nvm_cameras(path: Path) -> NvmCameras:
     Raises:
         InputError: for a file that is malformed as far as it is read.
     """
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with open_text(path) as file:
         return _read_cameras(_Lines(path, file))
 
 
@@ -58,7 +59,7 @@ def read_nvm(path: Path, wanted: set[str]) -> tuple[NvmCameras, dict[int, list[P
     Raises:
         InputError: for a malformed file.
     """
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with open_text(path) as file:
         lines = _Lines(path, file)
         cameras = _read_cameras(lines)
         seen: dict[int, list[Point]] = {row: [] for row, name in enumerate(cameras.names) if name in wanted}

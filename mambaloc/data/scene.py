@@ -246,7 +246,8 @@ class Scene:
 
     def _decode(self, frames: Frames, bad: BadFrames) -> LoadedSplit:
         cameras_of = partial(known_or_assumed_cameras, self.dataset, self.folder)
-        return load_split(frames, bad, cameras_of, self.short_side, self.crop, self.cache_dir)
+        is_mixed = self.dataset == CAPTURE  # whose cameras were fitted to each picture
+        return load_split(frames, bad, cameras_of, self.short_side, self.crop, self.cache_dir, is_mixed)
 
     def _with_points(self, loaded: LoadedSplit, splatter: Splatter | None = None) -> LoadedSplit:
         """Add what each frame may see, of the frames that could be decoded; from views' depth where that is given."""

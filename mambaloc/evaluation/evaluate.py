@@ -133,18 +133,19 @@ def _describe_model(system: LitPoseRegressor) -> dict[str, Any]:
 
 
 def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, both: Answers | None, trained: Trained) -> None:
-    frames = trained.data.frames("test")
+    frames, world = trained.data.frames("test"), trained.data.world
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         with whole_file(out / "metrics.json") as partial:
             partial.write_text(json.dumps(_finite(result), indent=2) + "\n", encoding="utf-8")
-        write_predictions(out / "predictions.csv", table, frames)
-        write_tum(out / "ground_truth.tum", table.index.tolist(), table.true_position_m, table.true_quaternion)
+        write_predictions(out / "predictions.csv", table, frames, world)
+        true_m = world.position_m(table.true_position_m.cpu())
+        write_tum(out / "ground_truth.tum", table.index.tolist(), true_m, table.true_quaternion)
         title = f"{result['model']['name']} on {result['data']['scene']}, test, {trained.chosen} epoch"
         if both is None:
             draw_trajectory(table, frames.sequences, out / "trajectory.png", title)
             return
-        write_predictions(out / "predictions_both.csv", both.table, frames, both.sources)
+        write_predictions(out / "predictions_both.csv", both.table, frames, world, both.sources)
         title = f"{result['model']['name']} and map on {result['data']['scene']}, test, {trained.chosen} epoch"
         draw_trajectory(both.table, frames.sequences, out / "trajectory.png", title, table)
 

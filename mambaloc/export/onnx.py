@@ -24,6 +24,7 @@ from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork, PositionScale
 from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, METADATA_KEY, Contract, Preprocessing
+from mambaloc.runtime.world import World
 from mambaloc.uncertainty import UncertaintyHead, pooled
 
 OPSET = 18
@@ -112,7 +113,10 @@ def export_onnx(
 
 
 def contract_of(
-    system: LitPoseRegressor, data: Mapping[str, Any], uncertainty: UncertaintyHead | None = None
+    system: LitPoseRegressor,
+    data: Mapping[str, Any],
+    uncertainty: UncertaintyHead | None = None,
+    world: World | None = None,
 ) -> Contract:
     """Say what a system's exported network promises.
 
@@ -120,6 +124,7 @@ def contract_of(
         system: trained.
         data: hyperparameters of the data module that it was trained with.
         uncertainty: that the model will tell.
+        world: of the scene; without a shift unless given.
     """
     preprocessing = Preprocessing(data["short_side"], system.image_size)
     scene = f"{data['dataset']}/{data['scene']}"
@@ -128,7 +133,16 @@ def contract_of(
     if system.network.takes_intrinsics:
         fx, _, cx, _, fy, cy, *_ = system.network.default_intrinsics.double().flatten().tolist()
         intrinsics = ((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
-    return Contract(system.registry_name, scene, preprocessing, system.provenance, weights, radii, intrinsics)
+    return Contract(
+        system.registry_name,
+        scene,
+        preprocessing,
+        system.provenance,
+        weights,
+        radii,
+        intrinsics,
+        world=world or World(),
+    )
 
 
 def weights_sha256(network: nn.Module) -> str:

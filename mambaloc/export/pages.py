@@ -74,13 +74,26 @@ Camera pose of one RGB image, {contract.pose}.
 `python tools/verify_bundle.py FOLDER` checks it, `python tools/demo.py FOLDER` shows it in a browser. An app ships a
 model, the map if there is one, and `contract.json`; `frames/` are for checking a port.
 
-{_lens(contract)}## How sure it is
+{_world(contract)}{_lens(contract)}## How sure it is
 
 {_uncertainty(contract)}
 
 ## Trained
 
 {trained}
+"""
+
+
+def _world(contract: Contract) -> str:
+    if not any(contract.world.offset_m):
+        return ""
+    return f"""## Where in the world
+
+The models, the map, `frames/` and `trajectory.json` are in the scene's own frame, so that float32 holds positions.
+Add `world.offset_m` in `contract.json`, {list(contract.world.offset_m)}, to a position **in double precision** for the
+world of the data that the scene was made of. `mambaloc.runtime.Localiser`, the trajectories of `tools/localize.py` and
+the page in the browser do so already.
+
 """
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc import provenance
-from mambaloc.data.datasets.capture import COLUMNS, FRAMES_FILE, SCENE_FILE, VERSION, VERSION_KEY
+from mambaloc.data.datasets.capture import COLUMNS, FRAMES_FILE, SCENE_FILE, VERSION, VERSION_KEY, WORLD_KEY
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.checks.agreement import Agreement
 from mambaloc.importing.checks.findings import Finding, Verdict
@@ -124,6 +124,7 @@ def write_scene(imported: Imported, folder: Path, source: Path, command: str) ->
         },
         "pose": POSE,
         "unit": "metre" if capture.unit == "metre" else _UNKNOWN,
+        WORLD_KEY: asdict(capture.world),
         "choices": dict(capture.choices),
         "cameras": cameras,
         "frames": {
@@ -161,7 +162,9 @@ def _described(camera: Camera, lens: Camera) -> dict[str, Any]:
         "centre_px": list(camera.centre_px),
     }
     if lens.distorted is None:
-        return {**told, "images": "as they were: the camera is a pinhole", "model": lens.model}
+        is_whole = (lens.width, lens.height) == (camera.width, camera.height)
+        images = "as they were" if is_whole else f"the middle of {lens.width}x{lens.height}"
+        return {**told, "images": f"{images}: the camera is a pinhole", "model": lens.model}
     was = {"model": lens.model, "focal_px": list(lens.focal_px), "centre_px": list(lens.centre_px)}
     zoom = camera.focal_px[0] / lens.focal_px[0]
     return {**told, "images": f"distortion removed; zoomed by {zoom:.4f}, so that no border is black", "lens": was}

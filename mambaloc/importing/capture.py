@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.data.tracks import Tracks
+from mambaloc.runtime.world import World
 
 Unit = Literal["metre", "unknown"]
 
@@ -71,8 +72,10 @@ class Capture:
         split: N of ``train``, ``val``, ``test`` where the format tells of them.
         poses_without_image: what the format names and is not there.
         images_without_pose: images beside those used.
+        left_out: why frames are left out that the format itself marks as bad, by file.
         depth: of the images, where the format has it and the images are those of a pinhole.
         tracks: points that the format says the images see.
+        world: where positions lie in the source's world.
     """
 
     kind: str
@@ -87,5 +90,7 @@ class Capture:
     split: tuple[str, ...] | None = None
     poses_without_image: tuple[str, ...] = ()
     images_without_pose: tuple[Path, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
     depth: Depth | None = None
     tracks: Tracks | None = None
+    world: World = field(default_factory=World)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from fractions import Fraction
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +10,7 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.files import whole_folder
 from mambaloc.importing.canonical import Imported, write_frames, write_scene
-from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks import sanity
 from mambaloc.importing.checks.agreement import Agreement, agreement, check_agreement
 from mambaloc.importing.checks.conventions import check_axes, check_up, up_of
@@ -23,11 +20,10 @@ from mambaloc.importing.registry import read_capture
 from mambaloc.importing.report import write_report
 from mambaloc.importing.splits.advisor import propose
 from mambaloc.importing.splits.selection import ASKED, Chosen, Proposal, choose
-from mambaloc.importing.undistort.pictures import Size, selected, write_pictures
+from mambaloc.importing.undistort.pictures import Written, write_pictures
+from mambaloc.importing.world import in_its_world
 
 _MOST_SCALE = 1e6
-_FAR = 1000.0
-"""Extents from the origin, beyond which it is shifted: float32 would be off by a ten-thousandth of the extent."""
 
 
 def import_scene(
@@ -38,6 +34,7 @@ def import_scene(
     split: str = "auto",
     command: str = "",
     with_adjusted: bool = False,
+    images: Path | None = None,
 ) -> Imported:
     """Read a capture, check it, split it, and write it as a scene's folder, which appears once it is whole.
 
@@ -49,6 +46,7 @@ def import_scene(
         split: of :data:`~mambaloc.importing.splits.selection.ASKED`.
         command: that this was asked for with.
         with_adjusted: also write poses that are adjusted to the pictures, in a file of their own.
+        images: the folder of the capture's images, where its format names them by paths; found unless given.
 
     Raises:
         InputError: for a source that is none, a folder that is there or cannot be written, or a split that cannot be
@@ -62,13 +60,12 @@ def import_scene(
         raise InputError(
             f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
         )
-    capture = read_capture(source, kind)
-    capture, broken = _without(capture, sanity.bad_poses(capture.world_from_cam))
-    capture = _near_the_origin(_in_metres(capture, metres_per_unit))
-    capture, far = _without(capture, sanity.far_poses(capture.world_from_cam))
+    capture = read_capture(source, kind, images)
+    named = capture.left_out
+    capture, lost = in_its_world(capture, metres_per_unit)
     with whole_folder(out, "choose another folder with --out") as partial:
-        written, sizes, rules = write_pictures(capture, partial)
-        imported = _checked(written, capture.cameras, sizes, {**broken, **far, **rules}, split, with_adjusted)
+        written = write_pictures(capture, partial)
+        imported = _checked(written, {**named, **lost, **written.rules}, split, with_adjusted)
         write_frames(imported, partial)
         if imported.capture.tracks:
             imported.capture.tracks.write(partial)
@@ -77,73 +74,28 @@ def import_scene(
     return imported
 
 
-def _without(capture: Capture, rules: Mapping[int, str]) -> tuple[Capture, dict[str, str]]:
-    """A capture without some rows, and the rule that each of them breaks, by file."""
-    kept = selected(capture, [row for row in range(len(capture.images)) if row not in rules])
-    return kept, {str(capture.images[row]): rule for row, rule in rules.items()}
-
-
-def _in_metres(capture: Capture, metres_per_unit: float | None) -> Capture:
-    if metres_per_unit is None:
-        return capture
-    world_from_cam = capture.world_from_cam.copy()
-    world_from_cam[:, :3, 3] *= metres_per_unit
-    told = (
-        f"multiplied by {metres_per_unit:g}, as --metres-per-unit says; otherwise: {capture.choices.get('scale', '')}"
-    )
-    depth = capture.depth and replace(capture.depth, step=capture.depth.step * metres_per_unit)
-    choices = {**capture.choices, "scale": told}
-    tracks = capture.tracks and capture.tracks.moved(metres_per_unit, np.zeros(3))
-    return replace(capture, world_from_cam=world_from_cam, unit="metre", choices=choices, depth=depth, tracks=tracks)
-
-
-def _near_the_origin(capture: Capture) -> Capture:
-    """Shift a world whose origin is so far away that float32 would blur it, as a map's is."""
-    position = capture.world_from_cam[:, :3, 3]
-    middle = np.median(position, axis=0).round() if len(position) else np.zeros(3)
-    extent = float(np.linalg.norm(np.ptp(position, axis=0))) if len(position) else 0.0
-    if np.linalg.norm(middle) <= _FAR * max(extent, 1e-3):
-        return replace(capture, choices={"origin": "as in the source", **capture.choices})
-    world_from_cam = capture.world_from_cam.copy()
-    world_from_cam[:, :3, 3] -= middle
-    told = f"shifted to {middle.tolist()} of the source's world, so that float32 holds the positions"
-    tracks = capture.tracks and capture.tracks.moved(1.0, -middle)
-    return replace(capture, world_from_cam=world_from_cam, choices={**capture.choices, "origin": told}, tracks=tracks)
-
-
-def _checked(
-    capture: Capture,
-    lenses: Mapping[str, Camera],
-    sizes: Sequence[Size],
-    left_out: Mapping[str, str],
-    asked: str,
-    with_adjusted: bool,
-) -> Imported:
-    """Check what was written, and split what can be used of it."""
-    usable = _of_the_usual_shape(sizes)
-    odd = len(sizes) - len(usable)
-    findings = [sanity.check_frames(len(usable), left_out), sanity.check_missing(capture)]
+def _checked(written: Written, left_out: Mapping[str, str], asked: str, with_adjusted: bool) -> Imported:
+    """Check what was written, and split it."""
+    capture = written.capture
+    findings = [sanity.check_frames(capture, left_out), sanity.check_missing(capture)]
     proposals: list[Proposal] = []
     chosen: Chosen | None = None
     agreeing: Agreement | None = None
-    adjusted = None
     split = np.full(len(capture.images), "unused", dtype="<U6")
     if not any(finding.is_fatal for finding in findings):
-        used = selected(capture, usable)
-        motion = motion_of(used)
-        agreeing = agreement(used, motion, with_adjusted)
-        if agreeing.adjusted is not None:
-            adjusted = capture.world_from_cam.copy()
-            adjusted[usable] = agreeing.adjusted.world_from_cam
-        findings += [sanity.check_sizes(sizes, odd), *check_agreement(agreeing), *_of_poses(used, motion)]
+        motion = motion_of(capture)
+        agreeing = agreement(capture, motion, with_adjusted)
+        findings += [sanity.check_sizes(written.sizes), sanity.check_pixels(written.decoding)]
+        findings += [*check_agreement(agreeing), *_of_poses(capture, motion)]
         if not any(finding.is_fatal for finding in findings):
-            proposals = propose(used, motion)
+            proposals = propose(capture, motion)
             chosen = choose(proposals, asked)
-            split[usable] = chosen.proposal.split
+            split = chosen.proposal.split
             findings.append(Finding("split", f"by {chosen.proposal.kind}: {chosen.proposal.how}", chosen.warning))
+    adjusted = None if agreeing is None else agreeing.adjusted
     return Imported(
         capture=capture,
-        lenses=lenses,
+        lenses=written.lenses,
         split=tuple(split.tolist()),
         findings=tuple(findings),
         verdict=verdict_of(findings),
@@ -151,7 +103,7 @@ def _checked(
         chosen=chosen,
         left_out=left_out,
         agreement=agreeing,
-        adjusted=adjusted,
+        adjusted=None if adjusted is None else np.asarray(adjusted.world_from_cam, np.float64),
     )
 
 
@@ -165,10 +117,3 @@ def _of_poses(capture: Capture, motion: Motion) -> list[Finding]:
         sanity.check_duplicates(capture, motion),
         sanity.check_times(capture),
     ]
-
-
-def _of_the_usual_shape(sizes: Sequence[Size]) -> list[int]:
-    """Rows of images of the most common ratio of sides: a training has one crop for all."""
-    shapes = [Fraction(*size) for size in sizes]
-    usual = Counter(shapes).most_common(1)[0][0] if shapes else None
-    return [row for row, shape in enumerate(shapes) if shape == usual]

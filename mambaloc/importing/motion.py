@@ -58,8 +58,7 @@ def motion_of(capture: Capture) -> Motion:
     later = 1 + np.flatnonzero(names[1:] == names[:-1])
     length = np.linalg.norm(position[later] - position[later - 1], axis=1)
     turn_deg = rotation_error_deg(quaternion[later], quaternion[later - 1])
-    low, high = np.percentile(position, (5, 95), axis=0)
-    extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(position, axis=0)))
+    extent = float(np.linalg.norm(sides_of(position))) or float(np.linalg.norm(np.ptp(position, axis=0)))
     in_order = len(later) > 0 and float(np.median(length)) <= _LONGEST_STEP * extent
     if in_order:
         step, step_deg = float(np.median(length)), float(np.median(turn_deg))
@@ -77,6 +76,12 @@ def motion_of(capture: Capture) -> Motion:
         in_order,
         later[jumps] if in_order else later[:0],
     )
+
+
+def sides_of(position: Floats) -> Floats:
+    """Sides of the box that holds nine tenths of positions (N, 3) along each axis; not interpolated."""
+    low = np.percentile(position, 5, axis=0, method="higher")
+    return np.maximum(np.percentile(position, 95, axis=0, method="lower") - low, 0.0)
 
 
 def quaternions(capture: Capture) -> Floats:

@@ -9,7 +9,18 @@ from pathlib import Path
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.formats import arkit, colmap, csv_table, kitti, nerfstudio, pose_folders, seven_scenes, tum
+from mambaloc.importing.formats import (
+    arkit,
+    colmap,
+    csv_table,
+    kitti,
+    nerfstudio,
+    pose_files,
+    pose_folders,
+    pose_lines,
+    seven_scenes,
+    tum,
+)
 from mambaloc.importing.sfm import structure
 
 
@@ -19,13 +30,15 @@ class Format:
 
     Args:
         looks_like: what a person sees, for messages.
-        matches: whether a source is in it, by the names of its files alone.
+        matches: whether a source is in it, by the names of its files, and by their lines where names tell nothing.
         read: read it; raises :class:`InputError` that names the file, the rule and the remedy.
+        names_images: whether the format names its images by their paths, so that ``read`` takes a folder to find them.
     """
 
     looks_like: str
     matches: Callable[[Path], bool]
-    read: Callable[[Path], Capture]
+    read: Callable[..., Capture]
+    names_images: bool = False
 
 
 def _by_name_alone(source: Path) -> bool:
@@ -34,7 +47,7 @@ def _by_name_alone(source: Path) -> bool:
 
 
 FORMATS: dict[str, Format] = {
-    "nerfstudio": Format("transforms.json of nerfstudio or instant-ngp", nerfstudio.matches, nerfstudio.read),
+    "nerfstudio": Format("transforms.json of nerfstudio or instant-ngp", nerfstudio.matches, nerfstudio.read, True),
     "record3d": Format("metadata and rgbd/ of Record3D", arkit.is_record3d, arkit.read_record3d),
     "polycam": Format("keyframes/cameras/ and images/ of Polycam", arkit.is_polycam, arkit.read_polycam),
     "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd),
@@ -46,19 +59,47 @@ FORMATS: dict[str, Format] = {
     ),
     "scannet": Format("color/ and pose/", pose_folders.is_scannet, pose_folders.read_scannet),
     "replica": Format("traj.txt and results/", pose_folders.is_replica, pose_folders.read_replica),
-    "colmap": Format("cameras, images and points3D", colmap.is_colmap, colmap.read_colmap),
-    "csv": Format("a .csv with columns image,x,y,z,qw,qx,qy,qz", csv_table.is_csv, csv_table.read_csv),
-    "csv_world_from_cam": Format("the same", _by_name_alone, partial(csv_table.read_csv, direction="world_from_cam")),
-    "csv_cam_from_world": Format("the same", _by_name_alone, partial(csv_table.read_csv, direction="cam_from_world")),
+    "colmap": Format("cameras, images and points3D", colmap.is_colmap, colmap.read_colmap, True),
+    "csv": Format("a .csv with columns image,x,y,z,qw,qx,qy,qz", csv_table.is_csv, csv_table.read_csv, True),
+    "csv_world_from_cam": Format(
+        "the same", _by_name_alone, partial(csv_table.read_csv, direction="world_from_cam"), True
+    ),
+    "csv_cam_from_world": Format(
+        "the same", _by_name_alone, partial(csv_table.read_csv, direction="cam_from_world"), True
+    ),
     "tum": Format("a .tum or trajectory.txt beside images", tum.is_tum, tum.read_tum),
     "kitti_poses": Format("a .kitti or poses.txt beside images", kitti.is_kitti_poses, kitti.read_kitti_poses),
+    "pose_lines": Format(
+        "lines of a 4x4 matrix, or of a picture's name and a pose, beside images",
+        pose_lines.is_pose_lines,
+        pose_lines.read_pose_lines,
+    ),
+    "pose_lines_world_from_cam": Format(
+        "the same", _by_name_alone, partial(pose_lines.read_pose_lines, direction="world_from_cam")
+    ),
+    "pose_lines_cam_from_world": Format(
+        "the same", _by_name_alone, partial(pose_lines.read_pose_lines, direction="cam_from_world")
+    ),
+    "pose_files": Format(
+        "a pose file beside each picture, as in a sequence of 7-Scenes",
+        pose_files.is_pose_files,
+        pose_files.read_pose_files,
+    ),
+    "pose_files_cam_from_world": Format(
+        "the same", _by_name_alone, partial(pose_files.read_pose_files, direction="cam_from_world")
+    ),
     "structure_from_motion": Format("a film or pictures alone", structure.is_pictures, structure.read_structure),
 }
 """By name, the most telling first: the first that matches a source is taken."""
 
 
-def read_capture(source: Path, kind: str | None = None) -> Capture:
+def read_capture(source: Path, kind: str | None = None, images: Path | None = None) -> Capture:
     """Read a capture, in the format that its files look like unless one is named.
+
+    Args:
+        source: the capture.
+        kind: of :data:`FORMATS`.
+        images: the folder of its images; found unless given.
 
     Raises:
         InputError: where there is no such source or format, or it cannot be read.
@@ -71,4 +112,14 @@ def read_capture(source: Path, kind: str | None = None) -> Capture:
     if kind is None:
         known = "; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
         raise InputError(f"{source}: looks like no format that is known ({known}); name it with --format")
-    return FORMATS[kind].read(source)
+    if images is None:
+        return FORMATS[kind].read(source)
+    if not FORMATS[kind].names_images:
+        able = ", ".join(name for name, each in FORMATS.items() if each.names_images)
+        raise InputError(
+            f"--images {images}: {kind} has its images in the capture. Leave it out; it is for formats that name their "
+            f"images by paths ({able})."
+        )
+    if not images.is_dir():
+        raise InputError(f"--images {images}: there is no such folder. Give that of the capture's images.")
+    return FORMATS[kind].read(source, images=images)

@@ -7,7 +7,7 @@ import itertools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -26,6 +26,7 @@ from mambaloc.mapping.structure import Structure, recover_structure
 from mambaloc.runtime.maps.drift import fit_drift
 from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.sparse_map import SparseMap
+from mambaloc.runtime.world import World
 
 if TYPE_CHECKING:
     from mambaloc.data.tracks import Tracks  # whose package needs torch
@@ -54,12 +55,14 @@ class PosedFrames:
 
     Args:
         tracks: points that structure from motion found with these poses, and where the frames see them.
+        world: where the scene's frame lies in the world of the data that it was made of.
     """
 
     images: Sequence[Path | Image]
     intrinsics: NDArray[np.float64]
     world_from_cam: NDArray[np.float64]
     tracks: Tracks | None = None
+    world: World = field(default_factory=World)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -71,6 +74,7 @@ class PosedFrames:
             self.intrinsics[rows],
             self.world_from_cam[rows],
             self.tracks and self.tracks.of_frames(rows),
+            self.world,
         )
 
 
@@ -144,6 +148,7 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
         structure.lenses[0],
         np.zeros((0, 6)) if tracks else drift,
         nugget,
+        world=frames.world,
     )
 
 

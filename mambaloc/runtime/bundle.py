@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -102,7 +102,8 @@ def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None
     """Let a model localise its bundle's frames: largest deviation in mm and degrees, and median latency in ms."""
     localiser = Localiser(model, threads)
     found = [(localiser.localise(model.parent / frame["file"], frame.get("intrinsics")), frame) for frame in frames]
-    return _compared(found)
+    offset_m = np.array(localiser.world.offset_m)  # frames are told in the scene's frame, as the models say them
+    return _compared([(replace(pose, position_m=pose.position_m - offset_m), frame) for pose, frame in found])
 
 
 def replay_map(folder: Path, frames: list[dict[str, Any]]) -> Replay:

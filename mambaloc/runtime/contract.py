@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mambaloc.errors import InputError
 from mambaloc.images import Image, center_corner, center_cropped, resized, resized_size
 from mambaloc.runtime.maps.features import check_intrinsics
+from mambaloc.runtime.world import World
 
 VERSION = 1
 _MOST_PIXELS = 8192  # of a side
@@ -85,6 +86,7 @@ class Contract:
         intrinsics: the training camera's pinhole matrix in pixels of the crop, for a model that takes intrinsics; what
             it is fed where the camera is unknown.
         pose: frame, units and order of its outputs.
+        world: where the scene's frame lies in that of the data it was made of.
     """
 
     model: str
@@ -95,6 +97,7 @@ class Contract:
     uncertainty: dict[str, Any] | None = None
     intrinsics: tuple[tuple[float, float, float], ...] | None = None
     pose: str = POSE
+    world: World = field(default_factory=World)
 
     @property
     def outputs(self) -> dict[str, list[str | int]]:
@@ -167,6 +170,7 @@ class Contract:
                 None if data.get("uncertainty") is None else dict(data["uncertainty"]),
                 None if data.get("intrinsics") is None else _matrix(data["intrinsics"], (width, height)),
                 str(data["pose"]),
+                World.from_json(data.get("world")),
             )
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             reason = f"{type(error).__name__}: {error}"

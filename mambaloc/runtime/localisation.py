@@ -29,7 +29,8 @@ class Localisation:
         no pose. ``covariance`` (6, 6).
 
     Args:
-        position_m: in the scene's frame.
+        position_m: in the scene's frame; as :class:`~mambaloc.runtime.Localiser` tells it, in the world of the data
+            that the scene was made of.
         quaternion: of the same pose.
         latency_s: seconds that it took, without decoding the image.
         position_radius_m: nine of ten poses are within this, as the model's contract says, or the covariance where the

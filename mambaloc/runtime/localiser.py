@@ -17,6 +17,7 @@ from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
 from mambaloc.runtime.network import Network
 from mambaloc.runtime.sources import SourceFrame, frames_of
+from mambaloc.runtime.world import World
 
 
 class Localiser:
@@ -64,8 +65,16 @@ class Localiser:
         assert self._map is not None  # one of the two is there
         return self._map.map.scene
 
+    @property
+    def world(self) -> World:
+        """Where the scene's frame lies in the world that answers are in: that of the data it was made of."""
+        if self._network is not None:
+            return self._network.contract.world
+        assert self._map is not None  # one of the two is there
+        return self._map.map.world
+
     def localise(self, image: str | Path | Image, intrinsics: ArrayLike | None = None) -> Localisation:
-        """Localise one image.
+        """Localise one image, in the world of the data that the scene was made of.
 
         Args:
             image: a file; or RGB (H, W, 3), or grey (H, W), ``uint8``, of any size.
@@ -86,7 +95,8 @@ class Localiser:
             _warn_of_focal_length(in_map)
         answer = network if in_map is None else combined(network, in_map)
         assert answer is not None  # one of the two is there
-        return replace(answer, latency_s=time.perf_counter() - start)
+        position_m = self.world.position_m(answer.position_m)
+        return replace(answer, position_m=position_m, latency_s=time.perf_counter() - start)
 
     def localise_each(
         self, source: str | Path | Iterable[SourceFrame], intrinsics: ArrayLike | None = None

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 
 from mambaloc.errors import InputError
-from mambaloc.images import PICTURES, Image, read_image
+from mambaloc.images import PICTURES, Counts, Image, is_picture, pictures, read_image
 
 PICTURES_HZ = 30.0
 """The rate at which a folder's pictures are taken to follow one another, as their files do not say it."""
@@ -33,38 +33,42 @@ class SourceFrame:
     image: Image
 
 
-def frames_of(source: str | Path, pictures_hz: float = PICTURES_HZ) -> tuple[Iterator[SourceFrame], int | None]:
+def frames_of(
+    source: str | Path, pictures_hz: float = PICTURES_HZ, counts: Counts | None = None
+) -> tuple[Iterator[SourceFrame], int | None]:
     """Open a source; return its frames, and how many there are where that is known.
 
     Args:
-        source: a video file, a picture, a folder of pictures (by name), or the number of a camera.
+        source: a video file, a picture, a folder of pictures (in natural order of their names), or the number of a
+            camera, where no file or folder has that name.
         pictures_hz: frames per second of a folder of pictures; a video and a camera have their own times.
+        counts: black and white of 16-bit pictures, as :func:`~mambaloc.images.read_image` takes them.
 
     Raises:
         InputError: where there is no such source, it is empty, or ``pictures_hz`` is not positive.
     """
     if not 0 < pictures_hz < math.inf:
         raise InputError(f"pictures_hz={pictures_hz}: must be a positive number of frames per second; correct it")
-    if str(source).isdecimal():
-        return _of_capture(_opened(int(str(source)), f"camera {source}"), live=True), None
     path = Path(source)
     if path.is_dir():
-        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES and ".depth." not in p.name)
-        if not pictures:
+        paths = pictures(path)
+        if not paths:
             raise InputError(f"{path}: holds no picture ({', '.join(PICTURES)}); give a folder of them or a video")
-        return _of_pictures(pictures, pictures_hz), len(pictures)
+        return _of_pictures(paths, pictures_hz, counts), len(paths)
     if not path.is_file():
+        if str(source).isdecimal():
+            return _of_capture(_opened(int(str(source)), f"camera {source}"), live=True), None
         raise InputError(f"{path}: no such file, folder or camera; a camera is a number, as 0")
-    if path.suffix.lower() in PICTURES:
-        return _of_pictures([path], pictures_hz), 1
+    if is_picture(path):  # else FFmpeg would take one tile of a phone's HEIC for a film
+        return _of_pictures([path], pictures_hz, counts), 1
     capture = _opened(str(path), str(path))
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     return _of_capture(capture), count if count > 0 else None
 
 
-def _of_pictures(paths: list[Path], rate_hz: float) -> Iterator[SourceFrame]:
+def _of_pictures(paths: list[Path], rate_hz: float, counts: Counts | None) -> Iterator[SourceFrame]:
     for number, path in enumerate(paths):
-        yield SourceFrame(path.name, number / rate_hz, read_image(path))
+        yield SourceFrame(path.name, number / rate_hz, read_image(path, counts))
 
 
 def _opened(what: str | int, name: str) -> cv2.VideoCapture:

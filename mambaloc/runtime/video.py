@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import track
 
 from mambaloc.errors import InputError
+from mambaloc.images import Counts
 from mambaloc.runtime.localisation import Localisation
 from mambaloc.runtime.localiser import Localiser
 from mambaloc.runtime.pose_filter import PoseFilter, smooth
@@ -68,6 +69,7 @@ def follow(
     out: Path,
     filtering: str | None = None,
     intrinsics: ArrayLike | None = None,
+    counts: Counts | None = None,
 ) -> Followed:
     """Localise every frame of a source with a progress bar on stderr, and write a TUM trajectory.
 
@@ -80,6 +82,7 @@ def follow(
         out: the trajectory.
         filtering: one of :data:`FILTERS`; poses are written as found unless given.
         intrinsics: of every frame, (3, 3) in pixels; the training camera's unless given.
+        counts: black and white of 16-bit pictures, as the scene's were.
 
     Raises:
         InputError: where there is no such source, it holds no frame, one cannot be localised, none has a pose, or
@@ -87,7 +90,7 @@ def follow(
     """
     if out.is_dir() or not out.absolute().parent.is_dir():
         raise InputError(f"--out {out}: there is no folder to write that file to; make it, or choose another")
-    frames, count = frames_of(source)
+    frames, count = frames_of(source, counts=counts)
     console = Console(stderr=True)
     found: list[tuple[float, Localisation]] = []
     kept: list[tuple[float, Localisation]] = []

@@ -8,6 +8,7 @@ import pytest
 
 from mambaloc.importing.registry import FORMATS, read_capture
 
+MATRIX = "1 0 0 2 0 1 0 3 0 0 1 4 0 0 0 1"
 FILES = {
     "record3d": ["metadata", "rgbd/0.jpg", "rgbd/0.depth"],
     "polycam": ["keyframes/cameras/1.json", "keyframes/images/1.jpg", "mesh_info.json", "polycam.mp4"],
@@ -22,6 +23,18 @@ FILES = {
     "kitti_poses": ["images/1.jpg", "poses.txt"],
     "structure_from_motion": ["a.jpg", "b.jpg", "notes.txt"],
 }
+WRITTEN = {
+    "pose_lines": {"images/1.jpg": "", "images/2.jpg": "", "any.log": f"{MATRIX}\n{MATRIX}\n"},
+    "pose_files": {"1.color.png": "", "1.pose.txt": MATRIX, "seq-02/1.color.png": "", "seq-02/1.pose.txt": MATRIX},
+    "tum": {"images/1.2.jpg": "", "path.txt": "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1 0\n"},
+    "kitti_poses": {"images/1.jpg": "", "path.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2},
+    "structure_from_motion": {
+        "1.jpg": "",
+        "1.txt": "0 0.5 0.5 0.1 0.1\n",
+        "intrinsics.txt": "500 0 320 0 500 240 0 0 1\n",
+    },
+}
+"""Files by what is in them: no name tells these formats."""
 ALSO = [
     ("record3d", ["metadata.json", "rgb/0.png"]),
     ("polycam", ["corrected_cameras/1.json", "corrected_images/1.jpg"]),
@@ -50,6 +63,14 @@ def test_each_format_is_taken_for_itself(tmp_path, kind, files):
     assert detected(make(tmp_path, files)) == kind
 
 
+@pytest.mark.parametrize(("kind", "files"), WRITTEN.items())
+def test_formats_are_told_by_their_lines(tmp_path, kind, files):
+    make(tmp_path, list(files))
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    assert detected(tmp_path) == kind
+
+
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
@@ -76,6 +97,9 @@ def test_every_format_is_tried_here():
     others = {
         "csv_world_from_cam",
         "csv_cam_from_world",
+        "pose_lines_world_from_cam",
+        "pose_lines_cam_from_world",
+        "pose_files_cam_from_world",
         "nerfstudio",
     }  # asked for by name; tested in a file of its own
-    assert set(FILES) == set(FORMATS) - others
+    assert set(FILES) | set(WRITTEN) == set(FORMATS) - others

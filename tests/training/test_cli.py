@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from lightning import Trainer
 
 import mambaloc
 from mambaloc.cli import main, recipe_arguments
 from mambaloc.errors import InputError
+from mambaloc.refusals import tell_refusals
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -63,6 +65,12 @@ def test_misplaced_recipe_is_refused(words, rule, tmp_path, monkeypatch):
         (["--data.image_size", "64"], ["short_side"]),
         (["--retrieval", "true"], ["retrieval", "scratch"]),
         (["--trainer.enable_checkpointing", "false"], ["enable_checkpointing", "save_top_k"]),
+        (["--trainer.strategy", "nonsense"], ["trainer.strategy: Lightning refuses it", "ddp_spawn"]),
+        (["--trainer.val_check_interval", "100"], ["trainer.val_check_interval: Lightning refuses it", "(100)"]),
+        (["--trainer.check_val_every_n_epoch", "0"], ["trainer.check_val_every_n_epoch: Lightning", "modulo by zero"]),
+        (["--best_checkpoint.mode=nonsense"], ["best_checkpoint.mode: Lightning refuses it", "min, max"]),
+        (["--trainer.precision", "bf16-true"], ["trainer.precision bf16-true", "Give bf16-mixed"]),
+        (["--trainer.callbacks+", "nonsense"], ["trainer.callbacks", "nonsense"]),
     ],
 )
 def test_mistake_is_one_line_and_exit_code_2(options, words, tiny_recipe, capsys):
@@ -72,6 +80,13 @@ def test_mistake_is_one_line_and_exit_code_2(options, words, tiny_recipe, capsys
     error = capsys.readouterr().err
     assert all(word in error for word in words), error
     assert len(error.strip().splitlines()) == 1
+
+
+def test_only_what_lightning_refuses_is_a_users_mistake():
+    with pytest.raises(InputError, match=r"trainer: Lightning refuses it .*max_epochs"), tell_refusals([]):
+        Trainer(max_epochs=-2, logger=False)
+    with pytest.raises(ValueError, match="ours"), tell_refusals(["--trainer.max_epochs"]):
+        raise ValueError("ours")
 
 
 @pytest.mark.slow

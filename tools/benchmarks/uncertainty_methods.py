@@ -19,7 +19,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.data.augmentation import center_crop
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, cropped_intrinsics, position_error_m, rotate, rotation_error_deg
-from mambaloc.images import PICTURES, read_image
+from mambaloc.images import PICTURES, pictures, read_image
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork
 from mambaloc.types import PosePrediction
@@ -273,7 +273,7 @@ def _test_frames(data: PoseDataModule) -> Pictures:
 
 def _pictures_of(folder: Path, data: PoseDataModule) -> Pictures:
     """Pictures of another place, their middle cut to the shape of the scene's frames."""
-    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in PICTURES)
+    paths = pictures(folder)
     if not paths:
         raise InputError(f"--elsewhere {folder}: holds no {', '.join(PICTURES)}; give a folder of pictures")
     height, width = next(_test_frames(data)())[0].shape[-2:]

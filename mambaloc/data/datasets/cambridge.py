@@ -15,6 +15,7 @@ from mambaloc.data.datasets.dataset import Archive, Dataset, Source
 from mambaloc.data.frames import FARTHEST_M, UNIT_TOLERANCE, BadFrames, Frames, Rejection, Split
 from mambaloc.errors import InputError
 from mambaloc.runtime.rotations import canonical, conjugate
+from mambaloc.text import decode_text
 
 # Scene, frames to train and test on where the benchmark has it, and where its zip is in the university's repository.
 # GreatCourt's and Street's REST addresses rest on a single public script.
@@ -74,7 +75,7 @@ def _listed_frames(split_file: Path) -> Iterator[tuple[int, list[str]]]:
     """
     if not split_file.is_file():
         raise InputError(f"{split_file}: missing; it lists the split's frames as lines 'ImageFile X Y Z W P Q R'")
-    lines = split_file.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = decode_text(split_file.read_bytes()).splitlines()
     for row, line in enumerate(lines, start=1):
         words = line.split()
         if row > _HEADER_LINES and words:

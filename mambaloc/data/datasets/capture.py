@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,15 @@ from mambaloc.data.frames import FARTHEST, UNIT_TOLERANCE, BadFrames, Frames, Sp
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
 from mambaloc.runtime.rotations import canonical
+from mambaloc.runtime.world import World
+from mambaloc.text import open_text
 
 CAPTURE = "capture"
 """Name of the dataset whose scenes ``tools/import_scene.py`` made, each named by its folder's path."""
 
 SCENE_FILE, FRAMES_FILE = "scene.json", "frames.csv"
 VERSION_KEY, VERSION = "mambaloc_scene", 1
+WORLD_KEY = "world"
 COLUMNS = ("image", "sequence", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz", "camera", "split")
 SPLITS = ("train", "val", "test", "unused")
 
@@ -121,11 +124,29 @@ def read_rows(folder: Path) -> list[Row]:
     return rows
 
 
+def world_of(folder: Path) -> World:
+    """Where an imported scene lies in the world of its source; no shift where a scene is older, or none was imported.
+
+    Raises:
+        InputError: where ``scene.json`` has none that can be read.
+    """
+    try:
+        return World.from_json(scene_note(folder).get(WORLD_KEY))
+    except ValueError as error:
+        raise InputError(f"{folder / SCENE_FILE}: {error}; {_MEND}") from None
+
+
 def describe_capture(folder: Path) -> dict[str, Any]:
-    """What an imported scene says of itself that a result must tell: its unit, where it is from, how it was split."""
+    """What an imported scene says of itself that a result must tell: its unit, where it is from, its world,
+    how it was split."""
     told = read_scene(folder)
     imported, split = (value if isinstance(value := told.get(key), dict) else {} for key in ("imported", "split"))
-    return {"unit": told.get("unit"), "format": imported.get("format"), "split_by": split.get("chosen")}
+    return {
+        "unit": told.get("unit"),
+        "format": imported.get("format"),
+        "split_by": split.get("chosen"),
+        "world": asdict(world_of(folder)),
+    }
 
 
 def _usable(folder: Path) -> None:
@@ -138,7 +159,7 @@ def _usable(folder: Path) -> None:
 def _table(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Rows of a CSV file by column, each with its line."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with open_text(path, newline="", errors="strict") as file:
             table = csv.reader(file, strict=True)
             header = next(table, [])
             if tuple(header) != COLUMNS:

@@ -16,6 +16,7 @@ from mambaloc.data.datasets.dataset import Archive, Dataset, Source
 from mambaloc.data.frames import ROTATION_TOLERANCE, BadFrames, Frames, Split
 from mambaloc.errors import InputError
 from mambaloc.runtime.rotations import is_rotation, quaternion_from_matrix
+from mambaloc.text import decode_text, natural
 
 # Scene, frames to train and test on, bytes and sha256 of its zip. Sizes and checksums are one public project's pins of
 # the files that it downloaded, not Microsoft's own figures; hence `accept_changed`.
@@ -68,7 +69,7 @@ def _listed_sequences(split_file: Path) -> list[int]:
     if not split_file.is_file():
         raise InputError(f"{split_file}: missing; it lists the split's sequences, a line 'sequenceN' each")
     numbers: dict[int, None] = {}  # in order, and found at once however many there are
-    for row, line in enumerate(split_file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for row, line in enumerate(decode_text(split_file.read_bytes()).splitlines(), start=1):
         if not line.strip():
             continue
         match = re.fullmatch(r"\s*sequence\s*(\d{1,6})\s*", line, re.IGNORECASE)
@@ -86,14 +87,14 @@ def _posed_images(sequence: Path, bad: BadFrames) -> list[tuple[Path, NDArray[np
     """Pair the images of a sequence with their matrices."""
     images: dict[str, Path] = {}
     poses: dict[str, Path] = {}
-    for path in sorted(sequence.iterdir()):
+    for path in sorted(sequence.iterdir(), key=natural):
         stem, _, kind = path.name.partition(".")
         if kind in ("color.png", "color.jpg"):
             images.setdefault(stem, path)
         elif kind == "pose.txt":
             poses[stem] = path
     posed = []
-    for stem in sorted(images.keys() | poses.keys()):
+    for stem in sorted(images.keys() | poses.keys(), key=lambda stem: natural(Path(stem))):
         if stem not in poses:
             bad.reject(images[stem], "image without pose")
         elif stem not in images:
@@ -108,8 +109,9 @@ def _posed_images(sequence: Path, bad: BadFrames) -> list[tuple[Path, NDArray[np
 def _read_matrix(path: Path) -> NDArray[np.float64] | str:
     """Read a 4x4 camera-to-world matrix, or return the rule it breaks."""
     try:
-        rows = [[float(word) for word in line.split()] for line in path.read_text().splitlines() if line.strip()]
-    except (ValueError, OSError):  # UnicodeDecodeError is a ValueError
+        lines = decode_text(path.read_bytes()).splitlines()
+        rows = [[float(word) for word in line.split()] for line in lines if line.strip()]
+    except (ValueError, OSError):
         return "pose is not a text of numbers"
     if len(rows) != 4 or any(len(row) != 4 for row in rows):
         return f"pose is not a 4x4 matrix but has rows of {[len(row) for row in rows][:6]}"

@@ -21,6 +21,7 @@ from mambaloc.data.frames import Cameras, Frames
 from mambaloc.data.points.scene_points import Points, ScenePoints, choose, frame_rng, stacked
 from mambaloc.errors import InputError
 from mambaloc.geometry import inverse, project, resized_intrinsics, transform
+from mambaloc.text import decode_text
 from mambaloc.types import Pose
 
 INTRINSICS_FILE = "camera-intrinsics.txt"
@@ -105,8 +106,9 @@ def read_depth_intrinsics(folder: Path, size: tuple[int, int]) -> NDArray[np.flo
         scale = (size[0] / _OFFICIAL_SIZE[0], size[1] / _OFFICIAL_SIZE[1])
         return resized_intrinsics(torch.from_numpy(_OFFICIAL_INTRINSICS), *scale).numpy()
     try:
-        matrix = np.array([line.split() for line in path.read_text().splitlines() if line.strip()], dtype=float)
-    except (ValueError, OSError):  # UnicodeDecodeError is a ValueError
+        lines = decode_text(path.read_bytes()).splitlines()
+        matrix = np.array([line.split() for line in lines if line.strip()], dtype=float)
+    except (ValueError, OSError):
         matrix = np.empty(0)
     is_pinhole = matrix.shape == (3, 3) and np.isfinite(matrix).all() and np.allclose(matrix[2], (0, 0, 1))
     if not is_pinhole or min(matrix[0, 0], matrix[1, 1]) <= 0 or matrix[1, 0] != 0:

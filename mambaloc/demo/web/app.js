@@ -118,6 +118,7 @@ async function startEngine(backend) {
   const { info } = engine;
   contract = info.contract;
   document.body.dataset.backend = info.backend;
+  readout.offset = contract.world?.offset_m ?? [0, 0, 0];
   $("model-line").textContent = `${contract.model} · ${contract.scene}`;
   $("wasm-name").textContent = info.backend === "wasm" ? `WASM, ${threads(info.threads)}` : "WASM";
   for (const input of document.querySelectorAll('[name="backend"]')) {

@@ -23,6 +23,9 @@ export class Readout {
   #errors = [];
   #last = -1;
 
+  /** Added to the positions of the scene's frame, it gives those of the data that the scene was made of. */
+  offset = [0, 0, 0];
+
   /** @param {number[]|null} up of the scene; without it there is no attitude to show. */
   constructor(up) {
     this.up = up;
@@ -52,7 +55,8 @@ export class Readout {
    * @param {string} file of a test frame, or "".
    */
   show(pose, source, file = "") {
-    const { position_m, quaternion_wxyz } = pose;
+    const { quaternion_wxyz } = pose;
+    const position_m = pose.position_m.map((value, axis) => value + this.offset[axis]);
     const data = this.#element.dataset;
     data.positionM = JSON.stringify(position_m);
     data.quaternionWxyz = JSON.stringify(quaternion_wxyz);

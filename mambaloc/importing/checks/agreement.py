@@ -120,7 +120,11 @@ def check_agreement(found: Agreement) -> list[Finding]:
     name, share = "images and poses", found.share[AS_READ]
     if not found.is_known:
         said = f"not compared: {found.matches} matches on {found.pairs} pairs of images"
-        return [Finding(name, said, figures=figures)]
+        concern = (
+            f"nothing could be compared: {found.matches} matches between images are too few to tell whether the poses "
+            "are theirs; look at trajectory.png, and give larger or more textured images if you can"
+        )
+        return [Finding(name, said, concern, figures=figures)]
     others = max(share for convention, share in found.share.items() if convention != AS_READ)
     guessed = ", focal length guessed" if found.is_guessed else ""
     said = f"{share:.0%} of {found.matches} matches on {found.pairs} pairs agree{guessed} (otherwise: {others:.0%})"

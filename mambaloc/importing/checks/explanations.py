@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
 from mambaloc.importing.checks.epipolar import agrees
 from mambaloc.importing.checks.matching import Matches
-from mambaloc.importing.formats.parsing import natural
+from mambaloc.text import natural
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from mambaloc.data.frames import FARTHEST, ROTATION_TOLERANCE
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.findings import Finding
-from mambaloc.importing.motion import Motion, quaternions
+from mambaloc.importing.motion import Motion, quaternions, sides_of
+from mambaloc.importing.undistort.decoding import Decoding
+from mambaloc.importing.undistort.fitting import is_same_shape
 from mambaloc.runtime.rotations import is_rotation
 
 LEAST_FRAMES = 20
@@ -19,6 +21,7 @@ _DUPLICATE_SHARE = 1e-6  # of the extent
 _DUPLICATE_DEG = 1e-3
 _MANY = 0.1
 _NAMED = 3
+_MUCH = 2.0
 
 
 def bad_poses(world_from_cam: NDArray[np.float64]) -> dict[int, str]:
@@ -53,23 +56,36 @@ def _broken(pose: NDArray[np.float64]) -> str:
     return f"pose's rotation is scaled by {scale:.4g}"
 
 
-def check_frames(kept: int, left_out: Mapping[str, str]) -> Finding:
-    """Say how many frames there are, and what was left out of them.
+def check_frames(capture: Capture, left_out: Mapping[str, str]) -> Finding:
+    """Say how many frames there are, and what was left out of them; of too few, every cause that is known.
 
     Args:
-        kept: how many.
+        capture: of those that are left.
         left_out: the rule that others break, by name.
     """
-    rules = Counter(left_out.values())
-    said = f"{kept}" + "".join(f"; {count} left out: {rule}" for rule, count in rules.most_common(_NAMED))
+    kept, rules = len(capture.images), Counter(left_out.values())
+    causes = [f"{count} left out: {rule}" for rule, count in rules.most_common()]
+    said = "; ".join((f"{kept}", *causes[:_NAMED]))
     figures = {"kept": kept, "left_out": dict(rules)}
     if kept < LEAST_FRAMES:
+        causes += _without(capture)
         concern = f"{kept} usable frames, and {LEAST_FRAMES} are needed to train on some and to test on others"
+        concern += f" ({'; '.join(causes)})" if causes else ""
         return Finding("frames", said, concern, is_fatal=True, figures=figures)
     concern = ""
     if left_out:
         concern = f"{len(left_out)} of {kept + len(left_out)} frames are left out ({rules.most_common(1)[0][0]})"
     return Finding("frames", said, concern, figures=figures)
+
+
+def _without(capture: Capture) -> list[str]:
+    """Poses without an image and images without a pose, as causes."""
+    found = []
+    if missing := capture.poses_without_image:
+        found.append(f"{len(missing)} poses without an image, as of {_some(missing)}")
+    if beside := capture.images_without_pose:
+        found.append(f"{len(beside)} images without a pose, as {_some([image.name for image in beside])}")
+    return found
 
 
 def check_missing(capture: Capture) -> Finding:
@@ -88,20 +104,33 @@ def check_missing(capture: Capture) -> Finding:
     return Finding("poses", said, concern, figures=figures)
 
 
-def check_sizes(sizes: Sequence[tuple[int, int]], odd: int) -> Finding:
-    """Say how large the images are.
-
-    Args:
-        sizes: (width, height) of each.
-        odd: how many are of another shape than most, and are not used.
-    """
+def check_sizes(sizes: Sequence[tuple[int, int]]) -> Finding:
+    """Say how large the images are, (width, height) of each."""
     counted = Counter(sizes).most_common(_NAMED)
     said = ", ".join(
         f"{width}x{height}" + (f" ({count})" if len(counted) > 1 else "") for (width, height), count in counted
     )
-    concern = f"{odd} images are shaped otherwise than most, and are not used" if odd else ""
+    odd = sum(not is_same_shape(size, counted[0][0]) for size in sizes)
+    concern = ""
+    if odd:
+        concern = (
+            f"{odd} images are shaped otherwise than most: all are used, and a training sees of each the middle that "
+            "every shape holds; data.image_size must be square for upright and lying ones"
+        )
     figures = {"sizes": {f"{width}x{height}": count for (width, height), count in counted}, "of_another_shape": odd}
     return Finding("image size", said, concern, figures=figures)
+
+
+def check_pixels(decoding: Decoding) -> Finding:
+    """Say which pixels of a picture with an EXIF orientation its pose means."""
+    concern = ""
+    if decoding.oriented and not decoding.upright and not decoding.known:
+        concern = (
+            f"{decoding.oriented} pictures have an EXIF orientation, and the format does not say whether poses mean "
+            "stored or upright pixels: taken as stored. If they mean upright ones, write the pictures so first, as "
+            "mogrify -auto-orient does"
+        )
+    return Finding("pixels", decoding.choices()["pixels"], concern, figures={"oriented": decoding.oriented})
 
 
 def check_steps(capture: Capture, motion: Motion, unit: str) -> Finding:
@@ -144,11 +173,17 @@ def check_duplicates(capture: Capture, motion: Motion) -> Finding:
 
 
 def check_extent(capture: Capture, motion: Motion, unit: str) -> Finding:
-    """Say how large the box around the camera centres is."""
+    """Say how large the box around nine tenths of the camera centres is, and around all where that is much larger."""
     position = capture.world_from_cam[:, :3, 3]
-    sides = np.ptp(position, axis=0)
-    said = f"{' x '.join(f'{side:.3g}' for side in sides)} {unit} along x, y, z"
-    figures = {"sides": sides.round(6).tolist(), "diagonal_of_nine_tenths": round(motion.extent, 6)}
+    sides, all_sides = sides_of(position), np.ptp(position, axis=0)
+    said = f"{' x '.join(f'{side:.3g}' for side in sides)} {unit} along x, y, z (nine tenths of the frames)"
+    if np.linalg.norm(all_sides) > _MUCH * np.linalg.norm(sides):
+        said += f"; of all frames {' x '.join(f'{side:.3g}' for side in all_sides)}"
+    figures = {
+        "sides": sides.round(6).tolist(),
+        "sides_of_all": all_sides.round(6).tolist(),
+        "diagonal_of_nine_tenths": round(motion.extent, 6),
+    }
     return Finding("extent", said, figures=figures)
 
 

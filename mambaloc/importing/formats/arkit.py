@@ -11,19 +11,21 @@ nerfstudio. The world is that of the first camera, whatever way it was held (iss
 
 Polycam (raw data): ``keyframes/cameras/STAMP.json`` with ``t_00`` to ``t_23``, the rows of a camera-to-world matrix,
 ``fx fy cx cy width height``, and ``keyframes/images/STAMP.jpg``; better ``corrected_cameras`` and ``corrected_images``
-once the app has optimised them. STAMP is in microseconds. Source: the readme of github.com/PolyCam/polyform.
+once the app has optimised them, where some versions leave width and height to ``cameras`` or to the image. STAMP is in
+microseconds. Source: the readme of github.com/PolyCam/polyform.
 
 ARCore: no app is known whose export of images with poses is common and documented, so there is no reader.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX
+from mambaloc.images import CORNER_PX, pictures, read_image
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import (
     Posed,
@@ -32,16 +34,10 @@ from mambaloc.importing.formats.builder import (
     pinhole,
     validate_se3,
 )
-from mambaloc.importing.formats.parsing import (
-    array_of,
-    first_with_pictures,
-    folder_name,
-    natural,
-    number_of,
-    pictures,
-    read_object,
-)
+from mambaloc.importing.formats.parsing import array_of, first_with_pictures, folder_name, number_of, read_object
+from mambaloc.text import natural
 
+_OFF_CENTRE = 0.05
 _CHOICES = {
     "axes": "ARKit's camera axes (y up, looking along -z) turned to OpenCV's; the world is kept",
     "direction": "camera-to-world, as the format has it",
@@ -66,7 +62,7 @@ def read_record3d(source: Path) -> Capture:
         raise InputError(f"{source}: is an archive; unpack it (unzip {source.name} -d FOLDER) and give the folder")
     path = _metadata(source)
     metadata = read_object(path, "poses, K, w and h of a Record3D recording")
-    rows = array_of(metadata.get("poses"), (None, 7), "poses", path)
+    rows = array_of(metadata.get("poses"), (None, 7), "poses", path, may_lack_fix=True)
     if len(rows) > 1 and not np.ptp(rows, axis=0).any():
         raise InputError(f"{path}: all {len(rows)} poses are the same; record with the LiDAR camera, which is tracked")
     quaternion = np.roll(rows[:, :4], 1, axis=1)
@@ -109,7 +105,7 @@ def read_polycam(source: Path) -> Capture:
         raise InputError(f"{source}: has no keyframes/cameras/STAMP.json; export 'raw data' in developer mode")
     images = {image.stem: image for image in pictures(folders[1])}
     sequence, present = folder_name(source), [file for file in files if file.stem in images]
-    read = [_polycam_frame(file) for file in present]
+    read = [_polycam_frame(file, images[file.stem]) for file in present]
     names, cameras = _told_apart([camera for _, camera in read])
     stamps = all(number_of(file) >= 0 for file in present)
     posed = [
@@ -160,11 +156,30 @@ def _polycam_folders(source: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _polycam_frame(path: Path) -> tuple[np.ndarray, Camera]:
+def _polycam_frame(path: Path, image: Path) -> tuple[np.ndarray, Camera]:
+    """Pose and camera of a file and its image."""
     frame = read_object(path, "a camera of Polycam")
     keys = [f"t_{row}{column}" for row in range(3) for column in range(4)]
     matrix = array_of([frame.get(key) for key in keys], (12,), "t_00 to t_23", path).reshape(1, 3, 4)
     fx, fy, cx, cy = array_of([frame.get(key) for key in ("fx", "fy", "cx", "cy")], (4,), "fx, fy, cx, cy", path)
-    size = array_of([frame.get("width"), frame.get("height")], (2,), "width, height", path).tolist()
+    size = _polycam_size(frame, (cx, cy), path, image)
     pose = validate_se3(matrix, lambda _: str(path))[0] @ OPENCV_FROM_OPENGL
     return pose, pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path)
+
+
+def _polycam_size(frame: dict[str, object], centre: Sequence[float], path: Path, image: Path) -> list[float]:
+    """Width and height that a camera is told for: by itself, by the one that was not corrected, or by its image.
+
+    That of the one that was not corrected counts where the principal point is about its middle: correcting may crop.
+    """
+    raw = path.parent.with_name(path.parent.name.removeprefix("corrected_")) / path.name
+    for file in dict.fromkeys((path, raw)):
+        told = frame if file == path else read_object(file, "a camera of Polycam") if file.is_file() else {}
+        sides = [told.get("width"), told.get("height")]
+        if sides == [None, None]:
+            continue
+        size = array_of(sides, (2,), "width, height", file).tolist()
+        if file == path or all(abs(at - side / 2) <= _OFF_CENTRE * side for at, side in zip(centre, size, strict=True)):
+            return size
+    height, width = read_image(image).shape[:2]
+    return [float(width), float(height)]

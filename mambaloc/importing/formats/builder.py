@@ -19,8 +19,6 @@ from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quat
 
 Matrices = NDArray[np.float64]
 
-_FARTHEST = 1e9  # in a file's own unit and world: the importer shifts worlds that are far from their origin
-
 
 @dataclass(frozen=True)
 class Posed:
@@ -45,6 +43,7 @@ def build_capture(
     cameras: Mapping[str, Camera] | None = None,
     missing: Sequence[str] = (),
     beside: Iterable[Path] = (),
+    left_out: Mapping[Path, str] | None = None,
     depth_camera: Matrices | None = None,
 ) -> Capture:
     """Make a capture: sequence after sequence, in the order of their first images.
@@ -58,11 +57,17 @@ def build_capture(
         cameras: by name.
         missing: images that the format names and that are not there.
         beside: images that are there, of which some may be among ``posed``.
+        left_out: why images are left out that the format marks as bad.
         depth_camera: (3, 3), in pixels of depth frames, which are in millimetres.
 
     Raises:
         InputError: for no image, one with two poses, or more than a scene may have.
     """
+    marked = left_out or {}
+    if not posed and marked:
+        raise InputError(
+            f"{source}: all {len(marked)} images with a pose are {next(iter(marked.values()))}; mark fewer"
+        )
     if not posed:
         named = f"; {len(missing)} are named and missing, such as {missing[0]!r}" if missing else ""
         raise InputError(f"{source}: has no image with a pose{named}; add them")
@@ -73,6 +78,7 @@ def build_capture(
         if each.image in used:
             raise InputError(f"{source}: gives {each.image} more than one pose; remove all but one")
         used.add(each.image)
+    known = {*used, *marked}
     rank = {name: at for at, name in enumerate(dict.fromkeys(each.sequence for each in posed))}
     ordered = sorted(posed, key=lambda each: rank[each.sequence])
     cameras_of = [each.camera for each in ordered if each.camera is not None]
@@ -90,7 +96,8 @@ def build_capture(
         time_s=np.array(times) if len(times) == len(ordered) else None,
         split=tuple(splits) if len(splits) == len(ordered) and set(splits) != {"unused"} else None,
         poses_without_image=tuple(missing),
-        images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in used),
+        images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in known),
+        left_out={str(image): rule for image, rule in marked.items()},
         depth=None if depth_camera is None else Depth(tuple(each.depth for each in ordered), depth_camera),
     )
 
@@ -99,42 +106,49 @@ def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
     """Check transforms, and make rotations that were rounded in a text exact.
 
     Args:
-        matrices: (N, 3, 4) or (N, 4, 4), finite.
+        matrices: (N, 3, 4) or (N, 4, 4).
         where: names a row, for messages.
 
     Returns:
-        (N, 4, 4).
+        (N, 4, 4); NaN where a pose is a mark of no fix: NaN, infinite, one number throughout, or a rotation of zeros.
 
     Raises:
-        InputError: for a row that is no rigid transform.
+        InputError: for any other row that is no rigid transform.
     """
+    lost = is_mark(matrices[:, :3].reshape(-1, 12), matrices[:, :3, :3].reshape(-1, 9))
+    matrices = np.where(lost[:, None, None], np.eye(4)[: matrices.shape[1]], matrices)
     rotation, position = matrices[:, :3, :3], matrices[:, :3, 3]
     _refuse(~is_rotation(rotation, ROTATION_TOLERANCE), where, "the pose's rotation is not orthonormal")
     if matrices.shape[1] == 4:
         is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
         _refuse(~is_last, where, "the pose's last row is not 0 0 0 1")
-    return _transforms(matrix_from_quaternion(quaternion_from_matrix(rotation)), position, where)
+    world_from_cam = rigid_transforms(matrix_from_quaternion(quaternion_from_matrix(rotation)), position)
+    return np.where(lost[:, None, None], np.nan, world_from_cam)
 
 
 def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[int], str]) -> tuple[Matrices, int]:
     """Transforms of positions and quaternions.
 
     Args:
-        position: (N, 3), finite.
-        quaternion: (N, 4), wxyz, finite; those that are about unit are made so.
+        position: (N, 3).
+        quaternion: (N, 4), wxyz; those that are about unit are made so.
         where: names a row, for messages.
 
     Returns:
-        (N, 4, 4), and how many quaternions were off by more than rounding.
+        (N, 4, 4), and how many quaternions were off by more than rounding. NaN where a pose is a mark of no fix: NaN,
+        infinite, one number throughout, or a quaternion of zeros.
 
     Raises:
-        InputError: for a quaternion that is far from unit, or a position that cannot be one.
+        InputError: for any other quaternion that is far from unit.
     """
+    lost = is_mark(np.concatenate((position, quaternion), axis=1), quaternion)
+    position = np.where(lost[:, None], 0.0, position)
+    quaternion = np.where(lost[:, None], (1.0, 0.0, 0.0, 0.0), quaternion)
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
     _refuse(~((norm > 0.5) & (norm < 2)), where, "the quaternion is far from unit length")
-    world_from_cam = _transforms(matrix_from_quaternion(quaternion), position, where)
-    return world_from_cam, int((np.abs(norm - 1) > UNIT_TOLERANCE).sum())
+    world_from_cam = rigid_transforms(matrix_from_quaternion(quaternion), position)
+    return np.where(lost[:, None, None], np.nan, world_from_cam), int((np.abs(norm - 1) > UNIT_TOLERANCE).sum())
 
 
 def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[float], where: str | Path) -> Camera:
@@ -164,10 +178,10 @@ def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[floa
     return Camera(int(width), int(height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
 
 
-def _transforms(rotation: Matrices, position: Matrices, where: Callable[[int], str]) -> Matrices:
-    """Homogeneous matrices of rotations (N, 3, 3) and positions (N, 3), which must not be too far away."""
-    _refuse(np.abs(position).max(axis=1, initial=0) > _FARTHEST, where, f"the position is farther than {_FARTHEST:g}")
-    return rigid_transforms(rotation, position)
+def is_mark(poses: Matrices, rotations: Matrices) -> NDArray[np.bool_]:
+    """Which rows (N, K) loggers and trackers write where they have no pose; of these the numbers of rotations."""
+    is_constant = (poses == poses[:, :1]).all(axis=1)
+    return ~np.isfinite(poses).all(axis=1) | is_constant | (rotations == 0).all(axis=1)
 
 
 def _refuse(is_bad: Any, where: Callable[[int], str], rule: str) -> None:

@@ -1,6 +1,7 @@
 """COLMAP models, text or binary, with any of its camera models.
 
-The model lies in ``SOURCE/sparse/0``, ``SOURCE/sparse`` or SOURCE itself, its images in ``SOURCE/images`` or beside.
+The model lies in ``SOURCE/sparse``, SOURCE or ``SOURCE/colmap/sparse``, or a numbered folder there: of several, the one
+with most images is read. Its images lie in ``SOURCE/images``, a smaller copy of that, or beside.
 COLMAP's poses turn the world into the camera, in OpenCV's camera axes and an arbitrary scale; its pixels are counted
 from the corner of the top-left one, half a pixel more than here. Source: colmap.github.io/format.html and cameras.html
 there; poses and projections are pycolmap's own.
@@ -16,45 +17,53 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder, is_sound, load_colmap
+from mambaloc.data.colmap import colmap_models, is_sound, load_colmap
+from mambaloc.data.colmap_text import count_images
 from mambaloc.data.tracks import Tracks
 from mambaloc.errors import InputError
+from mambaloc.files import path_inside
 from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, validate_se3
-from mambaloc.importing.formats.parsing import folder_name, inside, natural, pictures_beside
+from mambaloc.importing.formats.finding import SMALLER, Found, find_pictures
+from mambaloc.importing.formats.parsing import folder_name, pictures_beside
+from mambaloc.text import natural
 
-_PLACES = (*COLMAP_FOLDERS, ".")
+_ROOTS = ("sparse", ".", "colmap/sparse")
+_NAMED = 3  # other models
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
 
 def is_colmap(source: Path) -> bool:
     """Whether a folder is, or holds, a COLMAP model."""
-    return colmap_folder(source, _PLACES) is not None
+    return bool(colmap_models(source, _ROOTS))
 
 
-def read_colmap(source: Path) -> Capture:
+def read_colmap(source: Path, images: Path | None = None) -> Capture:
     """Read the images of a model that have a pose there, and their cameras.
+
+    Args:
+        source: the model's folder, or a scene's.
+        images: the folder that image names are relative to; found unless given.
 
     Raises:
         InputError: without pycolmap, or for a model that is damaged, or whose images are not there.
     """
-    path = colmap_folder(source, _PLACES)
-    if path is None:
+    models = colmap_models(source, _ROOTS)
+    if not models:
         raise InputError(f"{source}: holds no COLMAP model; give the folder of cameras, images and points3D")
+    path = models[0]
     model = load_colmap(path)
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: _key(image.name))
-    if not images:
+    placed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: _key(image.name))
+    if not placed:
         raise InputError(f"{path}: places none of its {len(model.images)} images; reconstruct again")
-    files = _files(source, path, [image.name for image in images])
-    cam_from_world = np.array([image.cam_from_world().matrix() for image in images])
-    if not np.isfinite(cam_from_world).all():
-        raise InputError(f"{path}: has a pose with NaN or infinite numbers; export it again")
-    world_from_cam = np.linalg.inv(validate_se3(cam_from_world, lambda row: f"{path}, image {images[row].name[:80]!r}"))
-    cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(images)}
+    found = _find(source, path, images, [image.name for image in placed])
+    cam_from_world = np.array([image.cam_from_world().matrix() for image in placed])
+    world_from_cam = np.linalg.inv(validate_se3(cam_from_world, lambda row: f"{path}, image {placed[row].name[:80]!r}"))
+    cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(placed)}
     posed, missing = [], []
-    for image, file, pose in zip(images, files, world_from_cam, strict=True):
-        if file.is_file():
+    for image, file, pose in zip(placed, found.files, world_from_cam, strict=True):
+        if file not in found.missing:
             posed.append(Posed(file, _sequence(image.name, source), pose, f"camera-{image.camera_id}"))
         else:
             missing.append(image.name)
@@ -63,13 +72,14 @@ def read_colmap(source: Path) -> Capture:
         "direction": "world-to-camera in the file, inverted",
         "scale": "unknown: COLMAP's is arbitrary",
         "origin": "kept",
-        "model": path.relative_to(source).as_posix(),
+        "model": _said(source, models),
+        **found.choices,
     }
     beside = pictures_beside(each.image for each in posed)
     capture = build_capture(
         "colmap", source, posed, unit="unknown", choices=choices, cameras=cameras, missing=missing, beside=beside
     )
-    image_of = dict(zip(files, images, strict=True))
+    image_of = dict(zip(found.files, placed, strict=True))
     return replace(capture, tracks=_tracks(model, [image_of[file] for file in capture.images]))
 
 
@@ -99,14 +109,29 @@ def _used(images: list[Any]) -> list[int]:
     return sorted({image.camera_id for image in images})
 
 
-def _files(source: Path, model: Path, names: list[str]) -> list[Path]:
-    """Where the images would be in the folder that holds most of them."""
-    folders = [source / "images", source]
-    if model == source:  # a model's own folder, such as sparse/0: images are beside sparse, too
+def _said(source: Path, models: list[Path]) -> str:
+    """Which model was read, and which were not."""
+    first, *others = (model.relative_to(source).as_posix() for model in models)
+    if not others:
+        return first
+    named = ", ".join(f"{name} ({count_images(source / name)} images)" for name in others[:_NAMED])
+    return f"{first}, with most images of {len(models)}; not read: {named}" + (", ..." if len(others) > _NAMED else "")
+
+
+def _find(source: Path, model: Path, images: Path | None, names: list[str]) -> Found:
+    """The images in the folder that is given, or in the first that has most of them."""
+    folders = [source / "images", source, *(source / f"images{end}" for end in SMALLER)]
+    if source in (model, model.parent):  # a model's own folder, such as sparse/0: images are beside sparse
         root = source.resolve()
         folders += [root.parent / "images", root.parent.parent / "images"]
-    candidates = [[inside(folder, name, f"{model}, images") for name in names] for folder in folders]
-    return max(candidates, key=lambda files: sum(file.is_file() for file in files))
+    folder, most = images or source, 0
+    for candidate in folders if images is None else ():
+        paths = [path_inside(candidate, name) for name in names]
+        count = sum(path is not None and path.is_file() for path in paths)
+        folder, most = (candidate, count) if count > most else (folder, most)
+        if most == len(names):
+            break
+    return find_pictures(folder, [(name, f"{model}, images") for name in names])
 
 
 def _sequence(name: str, source: Path) -> str:

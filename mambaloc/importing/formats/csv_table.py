@@ -6,7 +6,8 @@ project's; ``tx,ty,tz`` and a ``time`` are understood, too. The position is the 
 and an unknown unit in any other. The quaternion is what a dataset's own labels hold: in both tables of 7-Scenes
 camera-to-world, of Cambridge Landmarks **world-to-camera**, and no column says which. So it is taken as
 camera-to-world, unless a row is of a Cambridge scene: then the format must be named, ``csv_world_from_cam`` or
-``csv_cam_from_world``. ``q1`` to ``q4`` are scalar first in TransPoseNet's table, and refused in any other.
+``csv_cam_from_world``. ``q1`` to ``q4`` are scalar first in TransPoseNet's table, and refused in any other. A table
+without a column of images has a time, by which its rows are associated with pictures that are named by theirs.
 """
 
 from __future__ import annotations
@@ -20,9 +21,20 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
+from mambaloc.files import path_inside
+from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, inside, pictures_beside, read_text
+from mambaloc.importing.formats.finding import Found, find_pictures
+from mambaloc.importing.formats.parsing import (
+    as_numbers,
+    first_with_pictures,
+    folder_name,
+    pictures_beside,
+    read_text,
+)
+from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS
+from mambaloc.importing.formats.timing import pair, stamps_of
 
 Direction = Literal["world_from_cam", "cam_from_world"]
 
@@ -31,8 +43,9 @@ _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("t1", "t2", "t3"))
 _QUATERNIONS = (("qw", "qx", "qy", "qz"), ("q1", "q2", "q3", "q4"))
 _TRANSPOSENET = (_POSITIONS[2], _QUATERNIONS[1])
 _SEQUENCE = ("seq", "sequence")
-_TIME = ("time", "time_s", "timestamp")
+_TIME = ("time", "time_s", "timestamp", "timestamp [ns]", "timestamp_ns", "time_ns", "stamp")
 _SPLITS = {"train": "train", "training": "train", "test": "test", "val": "val", "valid": "val", "validation": "val"}
+_NO_FIX = ("", "null", "none", "na", "n/a", "-")
 _CAMBRIDGE = ("KingsCollege", "OldHospital", "ShopFacade", "StMarysChurch", "GreatCourt", "Street")
 
 
@@ -40,7 +53,7 @@ _CAMBRIDGE = ("KingsCollege", "OldHospital", "ShopFacade", "StMarysChurch", "Gre
 class _Columns:
     """Which column holds what."""
 
-    image: str
+    image: str | None
     position: tuple[str, ...]
     quaternion: tuple[str, ...]
     sequence: str | None
@@ -50,17 +63,27 @@ class _Columns:
 Row = tuple[int, dict[str, str]]
 
 
+@dataclass(frozen=True)
+class _Pictured:
+    """Pictures of a table: each with its sequence, row and time; how they were found, and those that are not there."""
+
+    frames: list[tuple[Path, str, int, float | None]]
+    how: str
+    missing: list[str]
+
+
 def is_csv(source: Path) -> bool:
     """Whether a source is a CSV file, or a folder that holds one."""
     return source.suffix.lower() == ".csv" or (source.is_dir() and any(source.glob("*.csv")))
 
 
-def read_csv(source: Path, direction: Direction | None = None) -> Capture:
+def read_csv(source: Path, direction: Direction | None = None, images: Path | None = None) -> Capture:
     """Read a table of one scene, whose image files lie by it.
 
     Args:
         source: the table, its folder, or a scene's folder beside a table of several.
         direction: of the quaternions; camera-to-world unless the table is of a scene whose labels are not.
+        images: the folder of the images; found by the table unless given.
 
     Raises:
         InputError: for a table that is damaged or can be read in more ways than one.
@@ -76,26 +99,23 @@ def read_csv(source: Path, direction: Direction | None = None) -> Capture:
         return f"{path}, line {rows[row][0]}"
 
     world_from_cam, mended = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), where)
-    folder, images = _images(path, rows, columns)
-    posed, missing = [], []
-    for (line, row), image, pose in zip(rows, images, world_from_cam, strict=True):
-        if image.is_file():
-            sequence = row[columns.sequence] if columns.sequence else image.parent.relative_to(folder).as_posix()
-            time_s = None if columns.time is None else _time(path, line, row[columns.time])
-            name = sequence if sequence not in ("", ".") else folder_name(folder)
-            posed.append(Posed(image, name, pose, time_s=time_s, split=_split(path, line, row)))
-        else:
-            missing.append(row[columns.image])
+    pictured = (_by_time if columns.image is None else _by_image)(path, rows, columns, images)
+    posed = [
+        Posed(image, sequence, world_from_cam[row], time_s=time_s, split=_split(path, *rows[row]))
+        for image, sequence, row, time_s in pictured.frames
+    ]
     is_known = columns.position == _POSITIONS[2] or (columns.position == _POSITIONS[0] and "scene" in rows[0][1])
     choices = {
         "axes": "OpenCV camera axes, as the datasets have them",
         "direction": "world-to-camera, as --format says" if direction == "cam_from_world" else "camera-to-world",
         "scale": "metres, as the datasets have them" if is_known else "unknown: the table does not tell",
         "origin": "kept",
+        "association": pictured.how,
     }
     if mended:
         choices["quaternions"] = f"{mended} of {len(rows)} were not of unit length, and made so"
     beside = pictures_beside(each.image for each in posed)
+    missing = pictured.missing
     kind = "csv" if direction is None else f"csv_{direction}"
     unit: Unit = "metre" if is_known else "unknown"
     return build_capture(kind, path, posed, unit=unit, choices=choices, missing=missing, beside=beside)
@@ -117,7 +137,7 @@ def _rows(path: Path) -> tuple[_Columns, list[Row]]:
     header = text.partition("\n")[0]
     reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=header.count))
     try:
-        names = [name.strip().lower() for name in next(reader, [])]
+        names = [name.strip().lower().lstrip("# ") for name in next(reader, [])]
         columns = _columns(path, names)
         rows = []
         for values in reader:
@@ -152,12 +172,15 @@ def _columns(path: Path, names: Sequence[str]) -> _Columns:
     twice = next((name for name in names if name and names.count(name) > 1), None)
     if twice:
         raise InputError(f"{path}, line 1: names the column {twice[:40]!r} twice; remove one")
+    time, image = at_most_one("time", _TIME), at_most_one("image file", _IMAGE)
+    if image is None and time is None:
+        the_one("image file", [(name,) for name in _IMAGE])
     columns = _Columns(
-        image=the_one("image file", [(name,) for name in _IMAGE])[0],
+        image=image,
         position=the_one("position", _POSITIONS),
         quaternion=the_one("quaternion", _QUATERNIONS),
         sequence=at_most_one("sequence", _SEQUENCE),
-        time=at_most_one("time", _TIME),
+        time=time,
     )
     if columns.quaternion == _QUATERNIONS[1] and (columns.position, columns.quaternion) != _TRANSPOSENET:
         raise InputError(f"{path}, line 1: q1,q2,q3,q4 do not say which is the scalar; name them qw,qx,qy,qz")
@@ -180,7 +203,7 @@ def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
 
 def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction: Direction | None) -> None:
     for line, row in rows:
-        first = row[columns.image].replace("\\", "/").partition("/")[0]
+        first = row.get(columns.image or "", "").replace("\\", "/").partition("/")[0]
         if direction is None and any(name in (row.get("scene"), first) for name in _CAMBRIDGE):
             raise InputError(
                 f"{path}, line {line}: is of Cambridge Landmarks, whose labels turn the world into the camera; say "
@@ -189,10 +212,11 @@ def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction:
 
 
 def _numbers(path: Path, line: int, row: dict[str, str], columns: _Columns) -> np.ndarray:
-    values = as_numbers([row[name] for name in (*columns.position, *columns.quaternion)])
-    if values is None or not np.isfinite(values).all():
+    words = [row[name] for name in (*columns.position, *columns.quaternion)]
+    values = as_numbers(["nan" if word.lower() in _NO_FIX else word for word in words])
+    if values is None:
         names = ",".join((*columns.position, *columns.quaternion))
-        raise InputError(f"{path}, line {line}: {names} must be finite numbers; correct or remove the row")
+        raise InputError(f"{path}, line {line}: {names} must be numbers; correct or remove the row")
     return values
 
 
@@ -200,16 +224,50 @@ def _turned(quaternion: np.ndarray, direction: Direction | None) -> np.ndarray:
     return quaternion * (1, -1, -1, -1) if direction == "cam_from_world" else quaternion
 
 
-def _images(path: Path, rows: list[Row], columns: _Columns) -> tuple[Path, list[Path]]:
+def _by_image(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> _Pictured:
+    folder, found = _images(path, rows, columns, given)
+    images, how = found.files, "; ".join(filter(None, ("by name", found.elsewhere)))
+    stamps = None
+    if columns.time is not None:
+        stamps = stamps_of([row[columns.time] for _, row in rows])
+        if stamps is None:
+            line, row = next(((line, row) for line, row in rows if stamps_of([row[columns.time]]) is None), rows[0])
+            time = row[columns.time][:40]
+            raise InputError(f"{path}, line {line}: time {time!r} is no number of seconds; correct it")
+    frames: list[tuple[Path, str, int, float | None]] = []
+    for place, ((_, row), image) in enumerate(zip(rows, images, strict=True)):
+        if image.is_file():
+            sequence = row[columns.sequence] if columns.sequence else image.parent.relative_to(folder).as_posix()
+            name = sequence if sequence not in ("", ".") else folder_name(folder)
+            frames.append((image, name, place, None if stamps is None else float(stamps.seconds[place])))
+    missing = [row[str(columns.image)] for (_, row), image in zip(rows, images, strict=True) if not image.is_file()]
+    return _Pictured(frames, how if stamps is None else f"{how}; timed in {stamps.unit}", missing)
+
+
+def _by_time(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> _Pictured:
+    images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
+    pairing = pair(images, [row[str(columns.time)] for _, row in rows], path)
+    name = folder_name(path.parent)
+    times_s = [None] * len(images) if pairing.time_s is None else pairing.time_s.tolist()
+    frames = [(images[place], name, row, times_s[place]) for place, row in pairing.pairs]
+    return _Pictured(sorted(frames, key=lambda frame: frame[3] or 0.0), pairing.how, pairing.missing)
+
+
+def _images(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> tuple[Path, Found]:
     """The folder that the table's names are relative to, and each row's file there."""
-    names = [(row[columns.image], row.get("scene", ""), f"{path}, line {line}") for line, row in rows]
-    root = path.parent
-    candidates = [
-        (root, [inside(root, name, where) for name, _, where in names]),
-        (root / "images", [inside(root / "images", name, where) for name, _, where in names]),
-        (root, [inside(root, name.removeprefix(f"{scene}/"), where) for name, scene, where in names]),
-    ]
-    return max(candidates, key=lambda candidate: sum(image.is_file() for image in candidate[1]))
+    names = [(row[str(columns.image)], row.get("scene", ""), f"{path}, line {line}") for line, row in rows]
+    whole = [(name, where) for name, _, where in names]
+    within = [(name.removeprefix(f"{scene}/"), where) for name, scene, where in names]
+    root = given or path.parent
+    candidates = [(root, whole), (root / "images", whole), (root, within)]
+    folder, named = max(candidates, key=lambda candidate: _count(*candidate))
+    return folder, find_pictures(folder, named)
+
+
+def _count(folder: Path, named: list[tuple[str, str]]) -> int:
+    """How many names are of files in a folder."""
+    paths = (path_inside(folder, name) for name, _ in named)
+    return sum(path is not None and path.is_file() for path in paths)
 
 
 def _split(path: Path, line: int, row: dict[str, str]) -> str | None:
@@ -218,10 +276,3 @@ def _split(path: Path, line: int, row: dict[str, str]) -> str | None:
     if row["split"].lower() not in _SPLITS:
         raise InputError(f"{path}, line {line}: split {row['split'][:40]!r} is none of train, val, test; correct it")
     return _SPLITS[row["split"].lower()]
-
-
-def _time(path: Path, line: int, text: str) -> float:
-    value = as_numbers([text])
-    if value is None or not np.isfinite(value).all():
-        raise InputError(f"{path}, line {line}: time {text[:40]!r} is no number of seconds; correct it")
-    return float(value[0])

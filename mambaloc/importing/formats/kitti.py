@@ -15,21 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import pictures, stored_size
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
     as_numbers,
     first_with_pictures,
-    folder_name,
     number_of,
-    pictures,
     read_lines,
     read_table,
 )
+from mambaloc.importing.formats.pose_lines import read_in_order
+from mambaloc.importing.formats.pose_rows import Layout, layout_of, pose_files
 
 _ROW = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
-_IMAGE_FOLDERS = ("image_2", "image_0", "images", "image", "rgb", "color", "frames", ".")
 _FARTHEST_M = 10.0  # between two cameras of one car
 _CHOICES = {
     "axes": "OpenCV camera axes, as the format has them",
@@ -51,7 +50,7 @@ def read_kitti(source: Path) -> Capture:
         InputError: for several sequences, whose worlds are not one, or a file that is missing or damaged.
     """
     sequence = _only_sequence(source)
-    table = read_table(_poses_file(sequence), 12, _ROW)
+    table = read_table(_poses_file(sequence), 12, _ROW, may_lack_fix=True)
     world_from_cam = validate_se3(table.numbers.reshape(-1, 3, 4), table.where)
     folder = first_with_pictures([sequence / "image_2", sequence / "image_0"])
     images = pictures(folder)
@@ -79,7 +78,7 @@ def read_kitti(source: Path) -> Capture:
 
 
 def is_kitti_poses(source: Path) -> bool:
-    """Whether a source is, or a folder holds, a bare pose file by its name."""
+    """Whether a source is, or a folder holds, a bare file of twelve numbers a line, by its lines or its name."""
     return bool(_bare_files(source))
 
 
@@ -92,19 +91,12 @@ def read_kitti_poses(source: Path) -> Capture:
     found = _bare_files(source) or [source]
     if len(found) > 1:
         raise InputError(f"{source}: holds {' and '.join(path.name for path in found)}; give the one to read")
-    table = read_table(found[0], 12, _ROW)
-    folder = first_with_pictures([found[0].parent / name for name in _IMAGE_FOLDERS])
-    images = pictures(folder)
-    if len(images) != len(table.lines):
+    layout = layout_of(found[0])
+    if layout is not None and (layout.is_named, layout.count) != (False, 12):
         raise InputError(
-            f"{found[0]}: has {len(table.lines)} poses, and {folder} {len(images)} images; "
-            "give as many, in the same order"
+            f"{found[0]}: does not have lines {_ROW!r}. Leave --format out, and its lines tell what it is."
         )
-    sequence = folder_name(found[0].parent)
-    poses = validate_se3(table.numbers.reshape(-1, 3, 4), table.where)
-    posed = [Posed(image, sequence, pose) for image, pose in zip(images, poses, strict=True)]
-    choices = {**_CHOICES, "scale": "unknown: a pose file does not tell", "association": "in the order of file names"}
-    return build_capture("kitti_poses", source, posed, unit="unknown", choices=choices)
+    return read_in_order(found[0], layout or Layout(False, False, 12), "kitti_poses", _CHOICES)
 
 
 def _poses_file(sequence: Path) -> Path:
@@ -137,8 +129,8 @@ def _camera(calibration: Path, name: str, image: Path) -> tuple[Camera, Matrices
     matrix = projection[:, :3]
     if not np.array_equal(matrix[2], (0, 0, 1)) or matrix[1, 0] != 0 or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise InputError(f"{calibration}: '{key}' is no projection K [I | t] of a rectified camera; get it again")
-    height, width = read_image(image).shape[:2]
-    camera = pinhole((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), calibration)
+    size = stored_size(image)
+    camera = pinhole(size, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), calibration)
     cam0_from_cam = np.eye(4)
     with np.errstate(over="ignore", invalid="ignore"):
         cam0_from_cam[:3, 3] = -np.linalg.solve(matrix, projection[:, 3])
@@ -157,6 +149,15 @@ def _times(path: Path, count: int) -> list[float] | None:
 
 
 def _bare_files(source: Path) -> list[Path]:
-    paths = [source] if source.is_file() else [source / "poses.txt"]
-    paths += sorted(source.glob("*.kitti")) if source.is_dir() else []
-    return [path for path in paths if path.is_file() and (path.suffix == ".kitti" or path.name == "poses.txt")]
+    if source.is_file():
+        layouts = {source: layout_of(source)}
+    else:
+        named = [source / "poses.txt", *(sorted(source.glob("*.kitti")) if source.is_dir() else [])]
+        layouts = {path: layout_of(path) for path in named if path.is_file()} or {**pose_files(source)}
+    return [path for path, layout in layouts.items() if _is_bare(path, layout)]
+
+
+def _is_bare(path: Path, layout: Layout | None) -> bool:
+    if layout is None:
+        return path.suffix == ".kitti" or path.name == "poses.txt"
+    return (layout.is_named, layout.count) == (False, 12)

@@ -1,24 +1,26 @@
 """``transforms.json`` of nerfstudio and instant-ngp, and NeRF's ``transforms_train.json`` with its companions.
 
-Each frame has a camera-to-world matrix in OpenGL's camera axes: x right, y up, z back.
+Each frame has a camera-to-world matrix in OpenGL's camera axes: x right, y up, z back. ScanNet++ has ``test_frames``
+beside ``frames``, and marks frames that are blurred or in shadow ``is_bad`` (github.com/scannetpp/scannetpp).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import PICTURES
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture
+from mambaloc.importing.formats.finding import find_pictures
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
-from mambaloc.importing.formats.parsing import inside, natural, pictures_beside, read_object
+from mambaloc.importing.formats.parsing import pictures_beside, read_object
 from mambaloc.runtime.rotations import is_rotation
+from mambaloc.text import natural
 
 FILES: Mapping[str, str | None] = {
     "transforms.json": None,
@@ -28,69 +30,124 @@ FILES: Mapping[str, str | None] = {
 }
 """Names of the file, the one that holds all frames first, and the split that its frames are of."""
 
+_LISTS = tuple(f"{split}_filenames" for split in ("train", "val", "test"))
+_READ = {"frames", "test_frames", "applied_transform", "applied_scale", *_LISTS, *KEYS}
+_READ_OF_FRAMES = {"file_path", "transform_matrix", "is_bad", *KEYS}
+_NAMED = 12  # keys that are not read
+_BAD = "marked is_bad by the capture"
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame of a file; ``split`` where the file tells it by where the frame is listed."""
+
+    where: str
+    name: Any
+    world_from_cam: Matrices
+    intrinsics: dict[str, Any]
+    split: str | None
+    is_bad: bool
+
 
 def matches(source: Path) -> bool:
     """Whether a source holds such a file, or is one."""
     return source.name in FILES if source.is_file() else any((source / name).is_file() for name in FILES)
 
 
-def read(source: Path) -> Capture:
+def read(source: Path, images: Path | None = None) -> Capture:
     """Read a folder that holds such files, or one of them.
 
     A pose that is not finite or no rotation is kept: the checks name its frame and leave it out.
 
+    Args:
+        source: the folder, or the file.
+        images: the folder of the images that the file names; the file's own unless given.
+
     Raises:
-        InputError: for a file that is malformed, or names an image outside of its folder or twice, or a camera that
-            cannot be one; and where none of its images is there.
+        InputError: for a file that is malformed, or names an image that is nowhere in the folder or twice, or a camera
+            that cannot be one; and where none of its images is there.
     """
     files = [source] if source.is_file() else [source / name for name in FILES if (source / name).is_file()]
     if not files:
         raise InputError(f"{source}: holds none of {', '.join(FILES)}; give a folder that does")
-    if files[0].name == "transforms.json":
-        del files[1:]
-    contents = {file: _content(file) for file in files}
+    contents = {file: _content(file) for file in (files[:1] if files[0].name == "transforms.json" else files)}
     frames = [frame for file, content in contents.items() for frame in _frames(file, content)]
-    frames.sort(key=lambda frame: (natural(frame[0].image.parent), natural(frame[0].image)))
-    present = [frame for frame in frames if frame[0].image.is_file()]
-    images, folder = [posed.image for posed, _ in frames], files[0].parent
+    lists = [entry for file, content in contents.items() for entry in _lists(file, content)]
+    folder = files[0].parent if images is None else images
+    named = [(frame.name, f"{frame.where}: file_path") for frame in frames]
+    found = find_pictures(folder, [*named, *((name, where) for _, name, where in lists)])
+    split_of = {file: split for file, (split, _, _) in zip(found.files[len(frames) :], lists, strict=True)}
+    pairs = sorted(zip(found.files, frames, strict=False), key=lambda pair: (natural(pair[0].parent), natural(pair[0])))
+    there = [(image, frame) for image, frame in pairs if image not in found.missing]
+    good = [(image, frame) for image, frame in there if not frame.is_bad]
     cameras, names, decided = read_cameras(
-        [intrinsics for _, intrinsics in present], [posed.image for posed, _ in present], files[0]
+        [frame.intrinsics for _, frame in good], [image for image, _ in good], files[0]
     )
+    posed = [
+        Posed(image, _sequence(image, folder), frame.world_from_cam, name, split=_split(image, frame, split_of))
+        for (image, frame), name in zip(good, names, strict=True)
+    ]
+    choices = _choices(files[0].name, contents[files[0]], [file.name for file in files if file not in contents])
     return build_capture(
         "nerfstudio",
         files[0],
-        [replace(posed, camera=name) for (posed, _), name in zip(present, names, strict=True)],
+        posed,
         unit="unknown",
-        choices={**_choices(files[0].name, contents[files[0]]), "cameras": decided},
+        choices={**choices, "cameras": decided, **found.choices},
         cameras=cameras,
-        missing=[image.relative_to(folder).as_posix() for image in images if not image.is_file()],
-        beside=pictures_beside(images),
+        missing=[image.relative_to(folder).as_posix() for image, _ in pairs if image in found.missing],
+        beside=pictures_beside(image for image, _ in pairs),
+        left_out={image: _BAD for image, frame in there if frame.is_bad},
     )
 
 
 def _content(file: Path) -> dict[str, Any]:
     content = read_object(file, "'frames' of nerfstudio or instant-ngp")
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+    for key in ("frames", "test_frames"):
+        frames = content.get(key, [] if key == "test_frames" else None)
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise InputError(f"{file}: has no list of '{key}'; give a transforms.json of nerfstudio or instant-ngp")
+    if not content["frames"]:
         raise InputError(f"{file}: has no list of 'frames'; give a transforms.json of nerfstudio or instant-ngp")
     return content
 
 
-def _frames(file: Path, content: dict[str, Any]) -> Iterator[tuple[Posed, dict[str, Any]]]:
+def _frames(file: Path, content: dict[str, Any]) -> Iterator[_Frame]:
     """Each frame with its intrinsics: its own, and the file's where it has none."""
     original_from_file, scale = _original_from_file(file, content)
     shared = {key: content[key] for key in KEYS if key in content}
-    splits = _named_splits(file, content)
-    for count, frame in enumerate(content["frames"], start=1):
-        where = f"{file}, frame {count}"
-        image = _image(file, frame.get("file_path"), f"{where}: file_path")
+    test = content.get("test_frames") or []
+    for count, frame in enumerate((*content["frames"], *test), start=1):
+        is_test = count > len(content["frames"])
+        where = f"{file}, test frame {count - len(content['frames'])}" if is_test else f"{file}, frame {count}"
         world_from_cam = _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix") @ OPENCV_FROM_OPENGL
         world_from_cam[:3, 3] /= scale
-        folder = image.parent.relative_to(file.parent)
-        sequence = folder.as_posix() if folder.name else "images"
-        split = FILES.get(file.name) or (splits.get(image, "unused") if splits else None)
-        posed = Posed(image, sequence, original_from_file @ world_from_cam, split=split)
-        yield posed, {**shared, **{key: frame[key] for key in KEYS if key in frame}}
+        yield _Frame(
+            where,
+            frame.get("file_path"),
+            original_from_file @ world_from_cam,
+            {**shared, **{key: frame[key] for key in KEYS if key in frame}},
+            FILES.get(file.name) or ("test" if is_test else "train" if test else None),
+            frame.get("is_bad") in (True, "true", "True"),
+        )
+
+
+def _lists(file: Path, content: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
+    """Split, name and place of each image of ``train_filenames`` and its like."""
+    for key in _LISTS:
+        names = content.get(key) or []
+        if not isinstance(names, list):
+            raise InputError(f"{file}: {key} is no list; correct it, or remove it")
+        yield from ((key.removesuffix("_filenames"), name, f"{file}: {key}") for name in names)
+
+
+def _split(image: Path, frame: _Frame, split_of: Mapping[Path, str]) -> str | None:
+    return split_of.get(image) or frame.split or ("unused" if split_of else None)
+
+
+def _sequence(image: Path, folder: Path) -> str:
+    parent = image.parent.relative_to(folder)
+    return parent.as_posix() if parent.name else "images"
 
 
 def _original_from_file(file: Path, content: dict[str, Any]) -> tuple[Matrices, float]:
@@ -106,38 +163,25 @@ def _original_from_file(file: Path, content: dict[str, Any]) -> tuple[Matrices, 
     return np.linalg.inv(applied).astype(np.float64), scale or 1.0
 
 
-def _choices(file: str, content: dict[str, Any]) -> dict[str, str]:
+def _choices(file: str, content: dict[str, Any], other_files: Sequence[str]) -> dict[str, str]:
     undone = [name for name in ("applied_transform", "applied_scale") if content.get(name) is not None]
     world = f"{' and '.join(undone)} undone: that of the data which {file} was made of"
-    return {
+    choices = {
         "axes": "OpenGL's (x right, y up, z back), turned to OpenCV's: the cameras' y and z axes are negated",
         "direction": f"camera to world, as {file} has it",
         "world": world if undone else f"that of {file}",
         "scale": "the format does not tell its unit",
         "order": "by file name, its numbers as numbers, since the format tells no time; a folder is a sequence",
     }
-
-
-def _named_splits(file: Path, content: dict[str, Any]) -> dict[Path, str]:
-    """The split of each image of ``train_filenames`` and its like."""
-    splits: dict[Path, str] = {}
-    for split in ("train", "val", "test"):
-        key = f"{split}_filenames"
-        names = content.get(key) or []
-        if not isinstance(names, list):
-            raise InputError(f"{file}: {key} is no list; correct it, or remove it")
-        splits |= {_image(file, name, f"{file}: {key}"): split for name in names}
-    return splits
-
-
-def _image(file: Path, name: Any, where: str) -> Path:
-    """The image that a file names, with its suffix or without."""
-    path = inside(file.parent, name, where)
-    if path.suffix.lower() in PICTURES:
-        return path
-    stem = path.relative_to(file.parent).as_posix()
-    named = (inside(file.parent, stem + suffix, where) for suffix in (*PICTURES, *map(str.upper, PICTURES)))
-    return next((image for image in named if image.is_file()), path)
+    of_frames = {key for frame in (*content["frames"], *(content.get("test_frames") or [])) for key in frame}
+    unread = [
+        *other_files,
+        *sorted(content.keys() - _READ),
+        *(f"{k} of frames" for k in sorted(of_frames - _READ_OF_FRAMES)),
+    ]
+    if unread:
+        choices["not read"] = ", ".join(name[:40] for name in unread[:_NAMED]) + (", ..." if unread[_NAMED:] else "")
+    return choices
 
 
 def _matrix(rows: Any, where: str) -> Matrices:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX, decode_image
+from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX, stored_size
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
 
@@ -25,7 +25,6 @@ KEYS = (
 
 _BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 _MOST_FOCAL_PX = 1e7
-_SAME_SHAPE = 0.01
 
 
 def read_cameras(
@@ -42,7 +41,7 @@ def read_cameras(
         Cameras by name; the name of each frame's camera, None where the file has no focal lengths; what was decided.
 
     Raises:
-        InputError: for intrinsics that no camera has, that are missing for some frames, or are of another image size.
+        InputError: for intrinsics that no camera has, or that are missing for some frames.
     """
     has_focal = [any(key in each for key in ("fl_x", "camera_angle_x")) for each in intrinsics]
     if not any(has_focal):
@@ -51,14 +50,18 @@ def read_cameras(
         raise InputError(
             f"{file}: tells a focal length of some frames, not of {images[has_focal.index(False)]}; add it"
         )
-    size = _first_size(images)
     keys = [repr(sorted(each.items())) for each in intrinsics]
-    names = {key: f"camera-{count}" for count, key in enumerate(dict.fromkeys(keys), start=1)}
-    cameras: dict[str, Camera] = {}
-    for key, each, image in zip(keys, intrinsics, images, strict=True):
-        if names[key] not in cameras:
-            cameras[names[key]] = _camera(each, size, f"{file}: camera of {image.name}")
-    return cameras, [names[key] for key in keys], _said(cameras, intrinsics[0], size)
+    frames: dict[str, list[int]] = {}
+    for row, key in enumerate(keys):
+        frames.setdefault(key, []).append(row)
+    names = {key: f"camera-{count}" for count, key in enumerate(frames, start=1)}
+    cameras = {
+        names[key]: _camera(
+            intrinsics[rows[0]], [images[row] for row in rows], f"{file}: camera of {images[rows[0]].name}"
+        )
+        for key, rows in frames.items()
+    }
+    return cameras, [names[key] for key in keys], _said(cameras)
 
 
 def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
@@ -75,9 +78,10 @@ def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
     return float(value)
 
 
-def _camera(told: Mapping[str, Any], size: tuple[int, int], where: str) -> Camera:
-    """A camera in pixels of images of a size (width, height)."""
-    sides = [number(told, key, where) or size[axis] for axis, key in enumerate("wh")]
+def _camera(told: Mapping[str, Any], images: Sequence[Path], where: str) -> Camera:
+    """A camera in pixels of the size that the file tells, or else of the first of its own images."""
+    size = [number(told, key, where) for key in "wh"]
+    sides = [side for side in size if side] if all(size) else list(map(float, _first_size(images)))
     focal = [_focal(told, axis, sides[axis], where) for axis in (0, 1)]
     focal_px = (focal[0], focal[1]) if focal[0] and focal[1] else (focal[0] or focal[1],) * 2
     centre = [number(told, key, where) for key in ("cx", "cy")]
@@ -86,14 +90,7 @@ def _camera(told: Mapping[str, Any], size: tuple[int, int], where: str) -> Camer
         raise InputError(f"{where}: {sides[0]:g}x{sides[1]:g} pixels, focal length {focal_px[0]:g}: correct it")
     if not all(-side < at < 2 * side for at, side in zip(centre_px, sides, strict=True)):
         raise InputError(f"{where}: its centre {centre_px} is far outside of the image; correct it")
-    scale = _scale(sides, size, where)
-    width, height = round(sides[0] * scale), round(sides[1] * scale)
-    camera = Camera(
-        width,
-        height,
-        (focal_px[0] * width / sides[0], focal_px[1] * height / sides[1]),
-        (centre_px[0] * width / sides[0] - CORNER_PX, centre_px[1] * height / sides[1] - CORNER_PX),
-    )
+    camera = Camera(round(sides[0]), round(sides[1]), focal_px, (centre_px[0] - CORNER_PX, centre_px[1] - CORNER_PX))
     return _with_lens(camera, told, where)
 
 
@@ -109,21 +106,6 @@ def _focal(told: Mapping[str, Any], axis: int, side: float, where: str) -> float
     if not 0 < angle_rad < math.pi:
         raise InputError(f"{where}: camera_angle_{key} is {angle_rad:g}, no angle of view in radians; correct it")
     return side / 2 / math.tan(angle_rad / 2)
-
-
-def _scale(sides: Sequence[float], size: tuple[int, int], where: str) -> float:
-    """What shrinks a camera's image to the images that are there: nerfstudio ships smaller ones beside the originals.
-
-    Images that lie on their side are told apart when they are decoded.
-    """
-    for width, height in (size, size[::-1]):
-        scales = width / sides[0], height / sides[1]
-        if abs(scales[0] / scales[1] - 1) <= _SAME_SHAPE:
-            return scales[0]
-    raise InputError(
-        f"{where}: is of {sides[0]:g}x{sides[1]:g} images, and the first one that is there has {size[0]}x{size[1]}; "
-        "correct w and h"
-    )
 
 
 def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
@@ -150,17 +132,16 @@ def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
 
 
 def _first_size(images: Sequence[Path]) -> tuple[int, int]:
-    """Width and height of the first image that can be decoded."""
+    """Width and height of the first image that can be decoded, as its file stores it."""
+    reasons = []
     for path in images:
-        image = decode_image(path.read_bytes())
-        if not isinstance(image, str):
-            return image.shape[1], image.shape[0]
-    raise InputError(f"{images[0]}: neither it nor any other of {len(images)} images can be decoded; add them again")
+        try:
+            return stored_size(path)
+        except InputError as error:
+            reasons.append(str(error))
+    raise InputError(f"{reasons[0]} (neither it nor any other of {len(images)} images can be decoded)")
 
 
-def _said(cameras: Mapping[str, Camera], told: Mapping[str, Any], size: tuple[int, int]) -> str:
+def _said(cameras: Mapping[str, Camera]) -> str:
     first = next(iter(cameras.values()))
-    said = f"{len(cameras)}, {first.model}; the centre of the top-left pixel was (0.5, 0.5), and is (0, 0)"
-    if told.get("w") not in (None, *size):
-        said += f"; told of {told['w']:g}x{told['h']:g} images, scaled to {first.width}x{first.height}"
-    return said
+    return f"{len(cameras)}, {first.model}; the centre of the top-left pixel was (0.5, 0.5), and is (0, 0)"

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
-from mambaloc.images import PICTURES
+from mambaloc.images import PICTURES, holds_pictures, pictures
+from mambaloc.text import decode_text
 
 _MOST_BYTES = 1 << 26  # of a text: poses of a million images
 
@@ -54,7 +55,7 @@ def read_text(path: Path, holds: str) -> str:
             raise InputError(f"{path}: missing; it holds {holds}")
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; give a text that holds {holds}")
-        return path.read_text(encoding="utf-8-sig", errors="replace")
+        return decode_text(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); it holds {holds}") from None
 
@@ -65,7 +66,7 @@ def read_lines(path: Path, holds: str) -> list[tuple[int, list[str]]]:
     return [(number, line.split()) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
-def read_table(path: Path, columns: int, row: str, named: bool = False) -> Table:
+def read_table(path: Path, columns: int, row: str, named: bool = False, may_lack_fix: bool = False) -> Table:
     """Read lines of so many finite numbers each.
 
     Args:
@@ -73,6 +74,7 @@ def read_table(path: Path, columns: int, row: str, named: bool = False) -> Table
         columns: numbers in a line.
         row: what a line is, for messages.
         named: whether a word comes before the numbers.
+        may_lack_fix: whether NaN and infinity are kept, which mark a pose without a fix.
 
     Raises:
         InputError: where it cannot be read, holds no line, or one of its lines is anything else.
@@ -81,7 +83,7 @@ def read_table(path: Path, columns: int, row: str, named: bool = False) -> Table
     numbers = np.empty((len(lines), columns))
     for at, (line, words) in enumerate(lines):
         values = as_numbers(words[int(named) :])
-        if values is None or len(values) != columns or not np.isfinite(values).all():
+        if values is None or len(values) != columns or not (may_lack_fix or np.isfinite(values).all()):
             raise InputError(f"{path}, line {line}: is no line {row!r} of finite numbers; correct or remove it")
         numbers[at] = values
     if not lines:
@@ -109,7 +111,9 @@ def read_object(path: Path, holds: str) -> dict[str, Any]:
     return value
 
 
-def array_of(value: Any, shape: tuple[int | None, ...], name: str, path: Path) -> NDArray[np.float64]:
+def array_of(
+    value: Any, shape: tuple[int | None, ...], name: str, path: Path, may_lack_fix: bool = False
+) -> NDArray[np.float64]:
     """Finite numbers of a JSON value.
 
     Args:
@@ -117,6 +121,7 @@ def array_of(value: Any, shape: tuple[int | None, ...], name: str, path: Path) -
         shape: what they must come in; None is any length.
         name: of the value, for messages.
         path: the file, likewise.
+        may_lack_fix: as of :func:`read_table`.
 
     Raises:
         InputError: for anything else.
@@ -126,7 +131,7 @@ def array_of(value: Any, shape: tuple[int | None, ...], name: str, path: Path) -
     except (TypeError, ValueError, OverflowError):  # no numbers, ragged, or larger than a float
         array = np.array(np.nan)
     fits = array.ndim == len(shape) and all(want in (None, is_) for want, is_ in zip(shape, array.shape, strict=True))
-    if not fits or not np.isfinite(array).all():
+    if not fits or not (may_lack_fix or np.isfinite(array).all()):
         size = " x ".join("N" if length is None else str(length) for length in shape) or "one"
         raise InputError(f"{path}: {name!r} must be {size} finite numbers; export it again")
     return array
@@ -149,30 +154,6 @@ def inside(folder: Path, name: Any, where: str) -> Path:
     return path
 
 
-def natural(path: Path) -> tuple[tuple[int, str, int, str], ...]:
-    """Key to sort files as a person does: ``2.jpg`` before ``10.jpg``."""
-    words = re.split(r"([0-9]+)", path.as_posix())
-    # Digits by their count, then one by one: Python refuses to make an int of more than 4300.
-    numbers = [word.lstrip("0") for word in words]
-    return tuple(
-        (1, "", len(number), number) if place % 2 else (0, word, 0, "")
-        for place, (word, number) in enumerate(zip(words, numbers, strict=True))
-    )
-
-
-def pictures(folder: Path) -> list[Path]:
-    """The pictures in a folder in natural order, without depth; none where there is no such folder.
-
-    Raises:
-        InputError: where it may not be read.
-    """
-    try:
-        files = list(folder.iterdir()) if folder.is_dir() else []
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}); make it readable") from None
-    return sorted((p for p in files if p.suffix.lower() in PICTURES and ".depth." not in p.name), key=natural)
-
-
 def pictures_beside(images: Iterable[Path]) -> list[Path]:
     """All pictures in the folders that images are in, as :func:`pictures`."""
     return [picture for folder in dict.fromkeys(image.parent for image in images) for picture in pictures(folder)]
@@ -185,7 +166,7 @@ def first_with_pictures(folders: Sequence[Path]) -> Path:
         InputError: where none does.
     """
     for folder in folders:
-        if pictures(folder):
+        if holds_pictures(folder):
             return folder
     names = ", ".join(str(folder) for folder in folders)
     raise InputError(f"{names}: none holds a picture ({', '.join(PICTURES)}); put the images there")

@@ -16,20 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import pictures, stored_size
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
     array_of,
     as_numbers,
     folder_name,
-    natural,
     number_of,
-    pictures,
     read_object,
     read_table,
     read_text,
 )
+from mambaloc.text import natural
 
 _CHOICES = {
     "axes": "OpenCV camera axes, as the format has them",
@@ -91,7 +90,7 @@ def read_replica(source: Path) -> Capture:
     Raises:
         InputError: for a file that is missing or damaged.
     """
-    table = read_table(source / "traj.txt", 16, _MATRIX)
+    table = read_table(source / "traj.txt", 16, _MATRIX, may_lack_fix=True)
     world_from_cam = validate_se3(table.numbers.reshape(-1, 4, 4), table.where)
     images = [image for image in pictures(source / "results") if image.name.startswith("frame")]
     numbered = {number_of(image): image for image in images}
@@ -128,8 +127,8 @@ def _scannet_camera(path: Path, image: Path) -> Camera | None:
     if not path.is_file():
         return None
     matrix = _read_matrix(path)
-    height, width = read_image(image).shape[:2]
-    return pinhole((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), path)
+    size = stored_size(image)
+    return pinhole(size, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), path)
 
 
 def _replica_camera(source: Path) -> Camera | None:

@@ -14,10 +14,11 @@ from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.data.datasets.seven_scenes import read_split
 from mambaloc.data.frames import BadFrames, Split
 from mambaloc.data.points.depth import depth_path, read_depth_intrinsics, read_depth_mm
-from mambaloc.images import read_image
+from mambaloc.images import stored_size
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, pinhole
 from mambaloc.runtime.rotations import matrix_from_quaternion
+from mambaloc.text import natural
 
 _CHOICES = {
     "axes": "OpenCV camera axes, as the format has them",
@@ -49,8 +50,8 @@ def read_seven_scenes(source: Path) -> Capture:
             depth_file = depth if depth.is_file() else None
             posed.append(Posed(image, frames.sequences[row], pose, "colour", split=split, depth=depth_file))
     matrix = frame_intrinsics("7scenes", source, frames)[0]
-    height, width = read_image(posed[0].image).shape[:2]
-    camera = pinhole((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), source)
+    size = stored_size(posed[0].image)
+    camera = pinhole(size, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), source)
     depth_files = [each.depth for each in posed if each.depth is not None]
     depth_camera = None
     if depth_files:
@@ -59,7 +60,7 @@ def read_seven_scenes(source: Path) -> Capture:
     return build_capture(
         "7scenes",
         source,
-        sorted(posed, key=lambda each: each.image),
+        sorted(posed, key=lambda each: natural(each.image)),
         unit="metre",
         choices=_CHOICES,
         cameras={"colour": camera},

@@ -21,12 +21,14 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 from mambaloc.data.colmap import import_pycolmap
 from mambaloc.errors import InputError
-from mambaloc.images import read_image
+from mambaloc.images import Counts, pictures, read_image
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.colmap import read_colmap
-from mambaloc.importing.formats.parsing import first_with_pictures, folder_name, pictures
+from mambaloc.importing.formats.parsing import first_with_pictures, folder_name
 from mambaloc.importing.sfm.frame_choice import choose_frames
 from mambaloc.importing.sfm.reconstruction import NEIGHBOURS, find_features, match_features, place_images, quiet_colmap
+from mambaloc.importing.sfm.unread import pose_like, warning_of
+from mambaloc.importing.undistort.decoding import choices_of, counts_of
 from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
 from mambaloc.user_cache import made_once
 
@@ -64,6 +66,10 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
         InputError: without pycolmap, where the source cannot be read, or too few frames could be placed.
     """
     import_pycolmap(source)
+    unread = pose_like(source)
+    if unread:
+        console = Console(stderr=True, highlight=False)
+        console.print(f"{source}: {warning_of(unread)}", markup=False, soft_wrap=True)
     source = source if source.is_file() else first_with_pictures([source, source / "images"])
     folder = made_once(f"structure/{_digest(source, seed)}", lambda partial: _make(source, partial, threads, seed))
     note = json.loads((folder / "note.json").read_text(encoding="utf-8"))
@@ -71,6 +77,7 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
     placed = set(capture.images)
     name = source.stem if source.is_file() else folder_name(source)
     kept = {"direction": "camera-to-world", "model": f"{folder.parent.name}/{folder.name} of the cache"}
+    kept |= {"not read": warning_of(unread)} if unread else {}
     return replace(
         capture,
         kind="structure_from_motion",
@@ -96,7 +103,8 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
     images = folder / "images"
     images.mkdir()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        frames, total = frames_of(source) if source.is_file() else _of_pictures(source)
+        counts = None if source.is_file() else counts_of(pictures(source))
+        frames, total = frames_of(source) if source.is_file() else _of_pictures(source, counts)
         is_film = source.is_file() or (total or 0) > _MOST_PHOTOGRAPHS
         seen = iter(progress.track(frames, total=total, description="Choosing frames"))
         time_s, sizes = _write(choose_frames(seen) if is_film else seen, images)
@@ -120,15 +128,18 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
         "frames": chosen if is_film else f"all {len(names)} photographs",
         "matching": f"{NEIGHBOURS} neighbours of each, and farther ones" if is_film else "every pair",
         "registered": f"{share} ({placed / len(names):.0%})",
+        **choices_of(counts),
     }
     note = {"choices": choices, "time_s": {name: time_s[name] for name in names} if source.is_file() else {}}
     (folder / "note.json").write_text(json.dumps(note, indent=2), encoding="utf-8")
 
 
-def _of_pictures(folder: Path) -> tuple[Iterator[SourceFrame], int]:
+def _of_pictures(folder: Path, counts: Counts | None) -> tuple[Iterator[SourceFrame], int]:
     """A folder's pictures in natural order, as frames."""
     paths = pictures(folder)
-    return (SourceFrame(str(at), at / PICTURES_HZ, read_image(path)) for at, path in enumerate(paths)), len(paths)
+    return (SourceFrame(str(at), at / PICTURES_HZ, read_image(path, counts)) for at, path in enumerate(paths)), len(
+        paths
+    )
 
 
 def _write(frames: Iterable[SourceFrame], folder: Path) -> tuple[dict[str, float], set[tuple[int, ...]]]:

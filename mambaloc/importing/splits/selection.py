@@ -20,7 +20,7 @@ from mambaloc.importing.motion import Motion, apart, quaternions
 
 Kind = Literal["given", "sequence", "loop", "block"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-"""In the order in which the rule prefers them: other recordings are most like what comes later."""
+"""In the order in which the rule prefers them: what the capture says, then recordings, most like what comes later."""
 ASKED = ("auto", *KINDS)
 
 NEAR_STEPS = 2.0
@@ -30,8 +30,9 @@ REACH_DEG = 30.0
 RULE = (
     f"A proposal is honest where at most {MOST_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
     f"training frame, and learnable where the median test frame's nearest one is within {REACH:.0%} of the scene's "
-    f"extent and {REACH_DEG:g}°. The first that is both is taken, in the order {', '.join(KINDS)}; failing that, the "
-    "one with the fewest near frames of those that are learnable, or of all, and then the nearest."
+    f"extent and {REACH_DEG:g}°. A given split is taken, whatever it measures. Of the others, the first that is both "
+    f"is taken, in the order {', '.join(KINDS[1:])}; failing that, the one with the fewest near frames of those that "
+    "are learnable, or of all, and then the nearest."
 )
 
 _MEASURED = 400  # test frames at most, evenly spread
@@ -120,12 +121,14 @@ def choose(proposals: Sequence[Proposal], asked: str) -> Chosen:
             there = ", ".join(each.kind for each in proposals)
             raise InputError(f"--split {asked}: this capture has {_LACKS[asked]}; choose one of auto, {there}")
         return Chosen(taken, "it was asked for", _warning(taken))
-    taken = next((each for each in proposals if each.is_good), None) or best_of(proposals)
-    why = (
-        "the first that is honest and learnable"
-        if taken.is_good
-        else "none is both honest and learnable, it comes nearest"
-    )
+    given = next((each for each in proposals if each.kind == "given"), None)
+    taken = given or next((each for each in proposals if each.is_good), None) or best_of(proposals)
+    if given:
+        why = "the capture gives it"
+    elif taken.is_good:
+        why = "the first that is honest and learnable"
+    else:
+        why = "none is both honest and learnable, it comes nearest"
     return Chosen(taken, why, _warning(taken))
 
 

@@ -4,71 +4,91 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from threading import Lock
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from mambaloc.images import Image, decode_image
+from mambaloc.exif import orientation_of, without_exif
+from mambaloc.images import Image, center_cropped
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.undistort.distortion import pinhole_of, sampled_at
+from mambaloc.importing.undistort.decoding import Decoding, decoding_of
+from mambaloc.importing.undistort.fitting import FittedCameras, Size, common_sizes
 
 IMAGES = "images"
 _JPEG_QUALITY = 95
 _KEPT_SUFFIXES = (".jpg", ".jpeg", ".png")
-_MAPS_KEPT = 4  # of cameras, at a time: each is as large as a few images
 _LONGEST_NAME = 80
 
-Size = tuple[int, int]
-Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+class Written(NamedTuple):
+    """Pictures in a scene's folder.
+
+    Args:
+        capture: of what was written; its cameras are pinholes.
+        sizes: (width, height) of each image.
+        rules: the rule that each of the others breaks, by file.
+        lenses: the cameras by the same names as the capture's, as they took the pictures.
+        decoding: how the pictures were decoded.
+    """
+
+    capture: Capture
+    sizes: list[Size]
+    rules: dict[str, str]
+    lenses: dict[str, Camera]
+    decoding: Decoding
 
 
-def write_pictures(capture: Capture, folder: Path) -> tuple[Capture, list[Size], dict[str, str]]:
-    """Write every image that can be decoded and is of its camera's size to ``FOLDER/images/SEQUENCE/NAME``.
+def write_pictures(capture: Capture, folder: Path) -> Written:
+    """Write every image that can be decoded and has its camera's shape to ``FOLDER/images/SEQUENCE/NAME``.
 
-    Files are copied byte by byte, unless distortion is removed from them or they lie on their side.
-
-    Returns:
-        The capture of what was written, whose cameras are pinholes; (width, height) of each image; and the rule that
-        each of the others breaks, by file.
+    Each has the pixels that its pose means, with 8 bits and without an EXIF orientation. Files are copied byte by byte
+    where nothing is to be done: neither this, nor distortion to be removed, nor sizes near each other to be made one.
 
     Raises:
         InputError: where a camera's distortion is that of no lens.
     """
-    pinholes = {name: pinhole_of(name, camera) for name, camera in capture.cameras.items()}
+    cameras, decoding = FittedCameras(capture.cameras), decoding_of(capture)
     targets = [folder / IMAGES / name for name in _names(capture)]
     for parent in {target.parent for target in targets}:
         parent.mkdir(parents=True, exist_ok=True)
-    lock = Lock()  # the first images of a camera all ask for its maps
 
-    @lru_cache(_MAPS_KEPT)
-    def maps_of(name: str) -> Maps | None:
-        camera = capture.cameras[name]
-        return None if camera.distorted is None else sampled_at(camera, pinholes[name])
-
-    def write(row: int) -> Size | str:
-        if capture.camera_of is None:
-            return _write(capture.images[row], targets[row], None, None)
-        name = capture.camera_of[row]
-        with lock:
-            maps = maps_of(name)
-        return _write(capture.images[row], targets[row], capture.cameras[name], maps)
+    def write(row: int, crop: Size | None = None) -> Size | str:
+        name = None if capture.camera_of is None else capture.camera_of[row]
+        return _write(capture.images[row], targets[row], decoding, cameras, name, crop)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = pool.map(write, range(len(targets)))
         written = list(track(results, "Writing images", len(targets), console=Console(stderr=True), transient=True))
-    sizes = {row: size for row, size in enumerate(written) if not isinstance(size, str)}
+        taken = {row: size for row, size in enumerate(written) if not isinstance(size, str)}
+        common = common_sizes(taken.values())
+        odd = [row for row, size in taken.items() if size != common[size]]
+        list(pool.map(write, odd, [common[taken[row]] for row in odd]))
     rules = {str(capture.images[row]): rule for row, rule in enumerate(written) if isinstance(rule, str)}
-    kept = replace(selected(capture, list(sizes)), images=tuple(targets[row] for row in sizes), cameras=pinholes)
-    return kept, list(sizes.values()), rules
+    kept = selected(capture, list(taken))
+    names, pinholes, lenses = cameras.as_used(kept.camera_of, list(taken.values()), common)
+    said = _said(capture.cameras, lenses, len(odd), len(taken))
+    images, choices = tuple(targets[row] for row in taken), {**capture.choices, **decoding.choices(), **said}
+    kept = replace(kept, images=images, cameras=pinholes, camera_of=names, choices=choices)
+    return Written(kept, [common[size] for size in taken.values()], rules, lenses, decoding)
+
+
+def _said(told: Mapping[str, Camera], lenses: Mapping[str, Camera], odd: int, count: int) -> dict[str, str]:
+    """What was decided of pictures whose size is not their camera's, or not the others'."""
+    found, known = ({(each.width, each.height) for each in cameras.values()} for cameras in (lenses, told))
+    said = {}
+    if sizes := sorted(found - known):
+        named = ", ".join(map(_times, sizes[:3]))
+        said["scaled cameras"] = f"to pictures of the same shape and another size than the capture says ({named})"
+    if odd:
+        said["cropped"] = f"{odd} of {count} pictures to the middle, so that sizes near each other are one"
+    return said
 
 
 def selected(capture: Capture, rows: Sequence[int]) -> Capture:
@@ -91,36 +111,55 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
     )
 
 
-def _write(source: Path, target: Path, camera: Camera | None, maps: Maps | None) -> Size | str:
-    """Write an image and return its (width, height), or the rule that it breaks."""
+def _write(
+    source: Path, target: Path, decoding: Decoding, cameras: FittedCameras, name: str | None, crop: Size | None
+) -> Size | str:
+    """Write an image, or the middle of it, and return its (width, height), or the rule that it breaks."""
     try:
         data = source.read_bytes()
     except OSError:
         return "image cannot be read"
-    image = decode_image(data)
-    if isinstance(image, str):
-        return image
-    is_as_it_is = True
-    if camera is not None and _size(image) != (camera.width, camera.height):
-        # Structure from motion may have ignored the EXIF orientation: the camera's size tells which way round it is.
-        stored = decode_image(data, upright=False)
-        if isinstance(stored, str) or _size(stored) != (camera.width, camera.height):
-            return f"image is {'x'.join(map(str, _size(image)))}, its camera's {camera.width}x{camera.height}"
-        image, is_as_it_is = stored, False
+    first, *others = decoding.ways(data)
+    if isinstance(first, str):
+        return first
+    image, maps = first, None
+    if name is not None:
+        own = cameras.size(name)
+        # A camera's size may tell that a pose means a picture the other way round.
+        ways = [first] if _size(first) == own else [first, *others]
+        fits = [(way, cameras.fitted(name, _size(way))) for way in ways if not isinstance(way, str)]
+        image, fit = max(fits, key=lambda fit: (_size(fit[0]) == own, fit[1] is not None))
+        if fit is None:
+            return f"image is {_times(_size(image))}, of another shape than its camera's {_times(own)}"
+        maps = fit[1]
+    is_upright = decoding.upright == (image is first)
+    if maps is None and crop is None and (copy := _untagged(data, is_upright)) and target.suffix in _KEPT_SUFFIXES:
+        target.write_bytes(copy)
+        return _size(image)
     if maps is not None:
         # The border's last hundredth of a pixel is rounding, and nothing to be black.
         image = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
-        is_as_it_is = False
-    if is_as_it_is and source.suffix.lower() in _KEPT_SUFFIXES:
-        target.write_bytes(data)
-    else:
-        options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if target.suffix != ".png" else []
-        target.write_bytes(cv2.imencode(target.suffix, image[..., ::-1], options)[1].tobytes())
+    if crop is not None:
+        image = center_cropped(image, crop[::-1])
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if target.suffix != ".png" else []
+    target.write_bytes(cv2.imencode(target.suffix, image[..., ::-1], options)[1].tobytes())
     return _size(image)
+
+
+def _untagged(data: bytes, is_upright: bool) -> bytes | None:
+    """The file of a JPEG or PNG of 8 bits without its orientation, its pixels as stored; None where it is another."""
+    is_jpeg, is_png = data.startswith(b"\xff\xd8"), data.startswith(b"\x89PNG") and data[24] <= 8
+    if orientation_of(data) == 1:
+        return data if is_jpeg or is_png else None
+    return without_exif(data) if is_jpeg and not is_upright else None
 
 
 def _size(image: Image) -> Size:
     return image.shape[1], image.shape[0]
+
+
+def _times(size: Size) -> str:
+    return f"{size[0]}x{size[1]}"
 
 
 def _names(capture: Capture) -> list[str]:

@@ -14,6 +14,7 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.rendering.quads import Vectors
 from mambaloc.runtime.rotations import matrix_from_quaternion
+from mambaloc.text import open_text
 
 Layout = Literal["7scenes", "cambridge"]
 FRAME_7SCENES = "seq-{sequence:02d}/frame-{frame:06d}.color.png"
@@ -65,7 +66,7 @@ def read_pose_table(path: Path, scene: str, layout: Layout) -> list[Shot]:
         raise InputError(f"{path}: there is no such file; give a CSV with the columns {','.join(_COLUMNS)}")
     scenes: set[str] = set()
     shots = []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+    with open_text(path, newline="") as file:
         rows = csv.DictReader(file)
         if missing := [name for name in _COLUMNS if name not in (rows.fieldnames or ())]:
             raise InputError(f"{path}, line 1: lacks the columns {','.join(missing)}; name them in the first line")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from mambaloc.runtime.maps.acceptance import RULE
 from mambaloc.runtime.maps.drift import NUGGET
 from mambaloc.runtime.maps.features import check_intrinsics
 from mambaloc.runtime.maps.lens import Lens
+from mambaloc.runtime.world import World
 
 VERSION = 2
 """Of files whose drift has changed since the map was built; others are of version 1."""
@@ -58,6 +59,7 @@ class SparseMap:
         sessions: what was added later: how many key frames each has by its name, in the order of ``key_poses``, whose
             last they are.
         first_drift: ``drift`` before any key frame was added; (0, 6) where it has not changed since.
+        world: where the scene's frame lies in that of the data it was made of.
     """
 
     points_m: NDArray[np.float32]
@@ -74,6 +76,7 @@ class SparseMap:
     nugget: float = NUGGET
     sessions: dict[str, int] = field(default_factory=dict)
     first_drift: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
+    world: World = field(default_factory=World)
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -118,6 +121,7 @@ class SparseMap:
             "nugget": self.nugget,
             "digests": self.digests,
             "sessions": self.sessions,
+            "world": asdict(self.world),
             "crc32": _crc32(arrays),
         }
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -183,6 +187,7 @@ class SparseMap:
             int(about["least_inliers"]), str(about["scene"]),
             {str(name): str(digest) for name, digest in dict(about["digests"]).items()},
             Lens(*map(float, arrays["lens"])), arrays["drift"], nugget, sessions, arrays["first_drift"],
+            World.from_json(about.get("world")),
         )  # fmt: skip
 
 

@@ -256,3 +256,33 @@ def test_a_camera_of_pictures_of_another_shape_is_refused(scene, tmp_path):
     edit(scene, cameras={"phone": {**phone, "height": 360}})
     with pytest.raises(InputError, match=r"\.png: has another shape than its camera's 640x360 pixels\. Give the"):
         module(scene, tmp_path).setup("fit")
+
+
+@pytest.mark.parametrize("has_cameras", [True, False])
+def test_upright_and_lying_pictures_train_together(scene, tmp_path, has_cameras):
+    """A bright spot on a known ray is where the intrinsics of the middle say, whatever its picture's shape."""
+    shapes = {"phone": (32, 24), "tablet": (48, 64)}
+    ray, cameras, expected = np.array([0.1, 0.2, 1.0]), {}, {}
+    for name, (width, height) in shapes.items():
+        matrix = np.array([[30.0, 0, width / 2 - 0.5], [0, 30.0, height / 2 - 0.5], [0, 0, 1]])
+        cameras[name] = {"width": width, "height": height, "focal_px": [30.0] * 2, "centre_px": matrix[:2, 2].tolist()}
+        column, row, _ = matrix @ ray
+        image = np.zeros((height, width, 3), np.uint8)
+        cv2.circle(image, (round(16 * column), round(16 * row)), 2 * 16, (255, 255, 255), -1, cv2.LINE_AA, shift=4)
+        expected[name] = image
+    for number in range(len(SPLITS)):
+        name = "tablet" if number % 2 else "phone"
+        cv2.imwrite(str(scene / f"images/walk/{number:03d}.png"), expected[name])
+        edit_row(scene, number, "camera", name if has_cameras else "")
+    edit(scene, cameras=cameras if has_cameras else {})
+    data = module(scene, tmp_path)
+    data.setup("fit")
+    batch = data.scene.items("train").__getitems__(list(range(6)))
+    assert batch.image.shape == (6, 3, 24, 24)
+    for image, intrinsics in zip(batch.image[:, 0].double(), batch.intrinsics.double(), strict=True):
+        rows, columns = np.mgrid[:24, :24]
+        spot = [float((image * each).sum() / image.sum()) for each in (columns, rows)]
+        if has_cameras:
+            np.testing.assert_allclose(intrinsics[:2] @ ray, spot, atol=0.1)
+        else:
+            assert intrinsics[0, 2] == intrinsics[1, 2] == 11.5

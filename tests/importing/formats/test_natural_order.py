@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from mambaloc.importing.formats.parsing import natural
+from mambaloc.text import natural
 
 
 def test_numbers_in_names_sort_by_their_value_however_long():

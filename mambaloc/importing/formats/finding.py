@@ -1,0 +1,211 @@
+"""Where the pictures are that a source names: by their paths, or by the ends of these below one folder.
+
+Paths are often those of another machine, or of the folder that a tool was called in. Nothing outside of the folder is
+looked at, and the search follows no symbolic link.
+"""
+
+from __future__ import annotations
+
+import os
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from mambaloc.errors import InputError
+from mambaloc.files import path_inside
+from mambaloc.images import PICTURES
+
+SMALLER = ("_2", "_4", "_8")
+"""What the folders of smaller copies add to a folder's name, the largest first: those of splatting data sets."""
+
+_MOST_FILES = 1_000_000
+_LONGEST_NAME = 255  # bytes
+_GIVE = "Give the folder of the pictures with --images."
+_GIVE_ELSE = "If they are elsewhere, give their folder with --images."
+
+Parts = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where the pictures are that a source names.
+
+    Args:
+        files: of each name, there or not.
+        missing: those that are not.
+        elsewhere: how those were found that are not where their names say, in a line; empty where all are.
+    """
+
+    files: tuple[Path, ...]
+    missing: frozenset[Path] = frozenset()
+    elsewhere: str = ""
+
+    @property
+    def choices(self) -> dict[str, str]:
+        """What was decided."""
+        return {"pictures": self.elsewhere} if self.elsewhere else {}
+
+
+def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
+    """Find pictures by the paths that a source has for them, with a picture's suffix or without.
+
+    A picture that is not where its path says is looked for in the folders of smaller copies, as ``images_4`` of
+    ``images``, and then by the longest end of its path that a file below the root has. An end of the file's name alone
+    counts only where all paths are of one folder: otherwise the folder may be what tells pictures apart.
+
+    Args:
+        root: the folder that paths are relative to.
+        named: paths, with either kind of slash, and what names each, for messages; in JSON a path may be anything.
+
+    Raises:
+        InputError: for a path that no file has, that leads out of the root where no picture below ends like it, or that
+            may mean two pictures; and where no picture is there.
+    """
+    direct = [path_inside(root, name) if isinstance(name, str) else None for name, _ in named]
+    files = [None if path is None else _there(root, path) for path in direct]
+    lost = [row for row, file in enumerate(files) if file is None]
+    moved = _by_tails(root, [named[row] for row in lost], {file for file in files if file}, named) if lost else []
+    for row, file in zip(lost, moved, strict=True):
+        files[row] = file
+    outside = [row for row in lost if direct[row] is None]
+    if outside and not any(files[row] for row in outside):
+        name, where = named[outside[0]]
+        raise InputError(
+            f"{where}: names {name[:60]!r}, which is no file inside of {root}, and no picture there has that path's "
+            f"end. {_GIVE}"
+        )
+    if not any(files):
+        raise InputError(
+            f"{root}: has no image with a pose; {len(named)} are named and missing, such as {named[0][0][-60:]!r}. Put "
+            f"them there. {_GIVE_ELSE}"
+        )
+    absent = {row: direct[row] or root / _parts(named[row][0])[-1] for row in lost if files[row] is None}
+    every = tuple(file or absent[row] for row, file in enumerate(files))
+    return Found(every, frozenset(absent.values()), _said(root, named, every, [row for row in lost if files[row]]))
+
+
+def _by_tails(
+    root: Path, lost: Sequence[tuple[Any, str]], taken: set[Path], named: Sequence[tuple[Any, str]]
+) -> list[Path | None]:
+    """The picture of each path that is not where it says, if one below the root has its end and no other path.
+
+    Raises:
+        InputError: for a path that no file has, or that may mean two pictures.
+    """
+    for name, where in lost:
+        if not isinstance(name, str) or not _is_possible(root, name):
+            raise InputError(
+                f"{where}: names {str(name)[:60]!r}, which is no file inside of {root}; write the picture's path there"
+            )
+    tails, least = _Tails(root), 1 if len({_parts(name)[:-1] for name, _ in named}) == 1 else 2
+    found = [tails.find(_parts(name), least, name, where) for name, where in lost]
+    return [None if file in taken else file for file in found]
+
+
+def _is_possible(root: Path, name: str) -> bool:
+    """Whether a file may have the name of a path, with a suffix if it lacks one."""
+    longest = "/".join(_parts(name))
+    longest += max(map(len, PICTURES)) * "_" if longest and not _has_suffix(longest) else ""
+    return path_inside(root, longest) is not None
+
+
+def _said(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], moved: Sequence[int]) -> str:
+    """How pictures were found that are not where their names say."""
+    if not moved:
+        return ""
+    name, place = named[moved[0]][0], files[moved[0]].relative_to(root).as_posix()
+    return f"{len(moved)} of {len(named)} by the ends of their paths: {name[-60:]!r} is {place}"
+
+
+def _parts(name: str) -> Parts:
+    """The parts of a path of any system, without its drive, ``.`` and what leads up before it."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    parts = [part for part in path.parts if part not in ("/", "//", ".")]
+    if PureWindowsPath(name).drive and parts:
+        parts = parts[1:] if parts[0].endswith(":") else parts
+    last_up = max((at for at, part in enumerate(parts) if part == ".."), default=-1)
+    return tuple(parts[last_up + 1 :])
+
+
+def _there(root: Path, path: Path) -> Path | None:
+    """The picture of a path, by itself, with a suffix, or as a smaller copy; None where there is none."""
+    ends = ("", *SMALLER) if path.parent != root else ("",)
+    for end in ends:
+        parent = path.parent.with_name(path.parent.name + end) if end else path.parent
+        for name in _spelled(path.name):
+            if (parent / name).is_file():
+                return parent / name
+    return None
+
+
+def _spelled(name: str) -> Iterator[str]:
+    """A picture's name with the suffixes that it may lack."""
+    if _has_suffix(name):
+        yield name
+    else:
+        spelled = (name + suffix for suffix in (*PICTURES, *map(str.upper, PICTURES)))
+        yield from (each for each in spelled if len(each.encode()) <= _LONGEST_NAME)
+
+
+def _has_suffix(name: str) -> bool:
+    return PurePosixPath(name).suffix.lower() in PICTURES
+
+
+class _Tails:
+    """The pictures below a folder, by their names."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.known: dict[str, list[Parts]] = defaultdict(list)
+        inside = root.resolve()
+        for at, (folder, folders, names) in enumerate(os.walk(root)):
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            if at + len(self.known) > _MOST_FILES:
+                raise InputError(f"{root}: has more than {_MOST_FILES} files and folders below. {_GIVE}")
+            for name in names:
+                file = Path(folder, name)
+                if file.suffix.lower() in PICTURES and (not file.is_symlink() or file.resolve().is_relative_to(inside)):
+                    self.known[_folded(name)].append(file.relative_to(root).parts)
+
+    def find(self, parts: Parts, least: int, name: str, where: str) -> Path | None:
+        """The picture with the longest common end, of so many parts at least.
+
+        Raises:
+            InputError: where two have it.
+        """
+        ends = {spelled: tuple(map(_folded, (*parts[:-1], spelled))) for spelled in _spelled(parts[-1])}
+        found = [
+            (_common(tuple(map(_folded, known)), end), known)
+            for end in ends.values()
+            for known in self.known.get(end[-1], ())
+        ]
+        longest = max((length for length, _ in found), default=0)
+        if longest < least:
+            return None
+        best = sorted({known for length, known in found if length == longest})
+        exact = [known for known in best if known[-1] in ends]
+        best = exact if len(exact) == 1 else best
+        if len(best) > 1:
+            raise InputError(
+                f"{where}: names {name[-60:]!r}, which may be {'/'.join(best[0])} or {'/'.join(best[1])} in "
+                f"{self.root}. {_GIVE}"
+            )
+        return self.root.joinpath(*best[0])
+
+
+def _common(known: Parts, end: Parts) -> int:
+    """How many parts two paths have in common, from their ends."""
+    length = 0
+    for a, b in zip(reversed(known), reversed(end), strict=False):
+        if a != b:
+            break
+        length += 1
+    return length
+
+
+def _folded(name: str) -> str:
+    """A name as file systems that know no case, or spell accents apart, have it."""
+    return unicodedata.normalize("NFC", name).casefold()

@@ -1,0 +1,218 @@
+"""Files of a pose a line that are neither KITTI's nor TUM's, beside their pictures.
+
+Sixteen numbers are a 4x4 matrix, camera-to-world; lines without a name are those of the pictures in natural order. A
+name may stand before twelve or sixteen numbers, or before seven: ``name qw qx qy qz tx ty tz`` is **world-to-camera**,
+scalar first, as in COLMAP's ``images.txt``, in hloc's results and in Map-free's ``poses.txt`` (Arnold et al. 2022,
+github.com/nianticlabs/map-free-reloc); with the position first, a line that names the columns must say where the scalar
+is, and poses are camera-to-world. ``intrinsics.txt`` with lines ``name fx fy cx cy width height`` is Map-free's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import numpy as np
+
+from mambaloc.errors import InputError
+from mambaloc.images import CORNER_PX, PICTURES, pictures
+from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole, validate_se3
+from mambaloc.importing.formats.parsing import (
+    Table,
+    as_numbers,
+    first_with_pictures,
+    folder_name,
+    inside,
+    pictures_beside,
+    read_lines,
+)
+from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS, Layout, layout_of, matrices_of, pose_files, read_rows
+from mambaloc.importing.formats.timing import pair
+
+Direction = Literal["world_from_cam", "cam_from_world"]
+
+_CHOICES = {"axes": "OpenCV camera axes", "scale": "unknown: a pose file does not tell", "origin": "kept"}
+_TABLE = "Write a table poses.csv with the columns image,x,y,z,qw,qx,qy,qz (camera centre, camera-to-world)."
+_WORLD_FROM_CAM = "camera-to-world"
+_CAM_FROM_WORLD = "world-to-camera, inverted"
+
+
+def is_pose_lines(source: Path) -> bool:
+    """Whether a source is, or a folder holds, a file of poses by its lines."""
+    return bool(_files(source))
+
+
+def read_pose_lines(source: Path, direction: Direction | None = None) -> Capture:
+    """Read a file of poses.
+
+    Args:
+        source: the file, or its folder.
+        direction: in which its poses transform; as the module says unless given.
+
+    Raises:
+        InputError: for a file that is damaged, can be read in more ways than one, or does not fit its pictures.
+    """
+    found = _files(source)
+    if len(found) > 1:
+        raise InputError(f"{source}: holds {' and '.join(path.name for path in found)}; give the one to read")
+    if not found:
+        raise InputError(f"{source}: has no lines of poses: 12 or 16 numbers of a matrix, or a name and 7. {_TABLE}")
+    ((path, layout),) = found.items()
+    if not layout.is_named and layout.count == 7:
+        raise InputError(f"{path}: has 7 numbers a line, which do not say whose pose each is. {_TABLE}")
+    if not layout.is_named:
+        how = {**_CHOICES, **_by_column(layout)}
+        return read_in_order(path, layout, "pose_lines", how, direction or "world_from_cam")
+    return _read_named(path, layout, direction)
+
+
+def read_in_order(
+    path: Path, layout: Layout, kind: str, choices: Mapping[str, str], direction: Direction = "world_from_cam"
+) -> Capture:
+    """Read matrices without names, which are those of the pictures beside their file, in natural order.
+
+    Args:
+        path: the file.
+        layout: of its lines.
+        kind: of the capture.
+        choices: made so far.
+        direction: in which poses transform.
+
+    Raises:
+        InputError: for a file that is damaged, or another number of pictures.
+    """
+    table = read_rows(path, layout, " ".join(["number"] * layout.count))
+    folder = first_with_pictures([path.parent / name for name in IMAGE_FOLDERS])
+    images = pictures(folder)
+    if len(images) != len(table.lines):
+        raise InputError(
+            f"{path}: has {len(table.lines)} poses, and {folder} {len(images)} images; give as many, in the same "
+            "order, or write each picture's name before its pose"
+        )
+    poses = towards_world(_transforms(table, layout), direction)
+    sequence = folder_name(path.parent)
+    return build_capture(
+        kind,
+        path.parent,
+        [Posed(image, sequence, pose) for image, pose in zip(images, poses, strict=True)],
+        unit="unknown",
+        choices={
+            **choices,
+            "direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD,
+            "scale": _CHOICES["scale"],
+            "association": "in the order of file names",
+        },
+    )
+
+
+def _files(source: Path) -> dict[Path, Layout]:
+    if not source.is_file():
+        return pose_files(source)
+    layout = layout_of(source)
+    return {} if layout is None else {source: layout}
+
+
+def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capture:
+    table = read_rows(path, layout, f"name and {layout.count} numbers")
+    if layout.count == 7:
+        world_from_cam, told = _of_sevens(table, layout, direction)
+    else:
+        direction = direction or "world_from_cam"
+        world_from_cam = towards_world(_transforms(table, layout), direction)
+        told = {"direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD}
+        told |= _by_column(layout)
+    rows, how, missing = _pictures_of(path, table)
+    cameras = _cameras(path.parent / "intrinsics.txt")
+    names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras.values()))}
+    camera_of = {name: names[camera] for name, camera in cameras.items()}
+    posed = [
+        Posed(
+            image,
+            _sequence(image, path.parent),
+            world_from_cam[row],
+            camera_of.get(image.relative_to(path.parent).as_posix()),
+            time_s,
+        )
+        for image, row, time_s in rows
+    ]
+    return build_capture(
+        "pose_lines",
+        path,
+        sorted(posed, key=lambda each: each.time_s or 0.0),
+        unit="unknown",
+        choices={**_CHOICES, **told, "association": how},
+        cameras={name: camera for camera, name in names.items()},
+        missing=missing,
+        beside=pictures_beside(image for image, _, _ in rows),
+    )
+
+
+def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tuple[Matrices, dict[str, str]]:
+    """Poses of a position and a quaternion, and what was decided of them."""
+    comes_first = layout.quaternion == 0
+    if (comes_first and not layout.is_text) or (not comes_first and layout.scalar is None):
+        raise InputError(
+            f"{table.path}: its lines do not say {'in which direction' if comes_first else 'where'} "
+            f"{'poses transform' if comes_first else 'the scalar of their quaternions is'}. {_TABLE}"
+        )
+    scalar = layout.scalar or "first"
+    quaternion = table.numbers[:, layout.quaternion :][:, :4]
+    position = table.numbers[:, 4:] if comes_first else table.numbers[:, :3]
+    if scalar == "last":
+        quaternion = np.roll(quaternion, 1, axis=1)
+    poses, mended = from_quaternions(position, quaternion, table.where)
+    direction = direction or ("cam_from_world" if comes_first else "world_from_cam")
+    told = {"direction": f"{_WORLD_FROM_CAM if direction == 'world_from_cam' else _CAM_FROM_WORLD}, scalar {scalar}"}
+    if mended:
+        told["quaternions"] = f"{mended} of {len(table.lines)} were not of unit length, and made so"
+    return towards_world(poses, direction), told
+
+
+def _transforms(table: Table, layout: Layout) -> Matrices:
+    return validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
+
+
+def towards_world(poses: Matrices, direction: Direction) -> Matrices:
+    """``world_from_cam`` of transforms (N, 4, 4) of a direction; NaN stays NaN."""
+    return poses if direction == "world_from_cam" else np.linalg.inv(poses).astype(np.float64)
+
+
+def _pictures_of(path: Path, table: Table) -> tuple[list[tuple[Path, int, float | None]], str, list[str]]:
+    """Each picture with its row and time, how they were associated, and the names whose pictures are not there."""
+    if all(PurePosixPath(word).suffix.lower() in PICTURES for word in table.words):
+        root = path.parent
+        places = [
+            [inside(folder, word, table.where(row)) for row, word in enumerate(table.words)]
+            for folder in (root, *(root / name for name in IMAGE_FOLDERS[:-1]))
+        ]
+        files = max(places, key=lambda each: sum(file.is_file() for file in each))
+        missing = [word for word, file in zip(table.words, files, strict=True) if not file.is_file()]
+        return [(file, row, None) for row, file in enumerate(files) if file.is_file()], "by name", missing
+    images = pictures(first_with_pictures([path.parent / name for name in IMAGE_FOLDERS]))
+    pairing = pair(images, table.words, path)
+    times_s = [None] * len(images) if pairing.time_s is None else pairing.time_s.tolist()
+    return [(images[i], row, times_s[i]) for i, row in pairing.pairs], pairing.how, pairing.missing
+
+
+def _sequence(image: Path, root: Path) -> str:
+    return image.parent.relative_to(root).as_posix() if image.parent != root else folder_name(root)
+
+
+def _by_column(layout: Layout) -> dict[str, str]:
+    return {"matrices": "written column after column"} if layout.by_column else {}
+
+
+def _cameras(path: Path) -> dict[str, Camera]:
+    """Cameras by picture's name, of lines ``name fx fy cx cy width height``; none where the file is another."""
+    if not path.is_file():
+        return {}
+    found = {}
+    for line, (name, *words) in read_lines(path, "lines 'name fx fy cx cy width height'"):
+        values = as_numbers(words)
+        if values is None or len(values) != 6 or not np.isfinite(values).all():
+            return {}
+        fx, fy, cx, cy, width, height = values.tolist()
+        found[name] = pinhole((width, height), (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), f"{path}, line {line}")
+    return found

@@ -1,0 +1,141 @@
+"""The camera rule of all formats: a camera is judged by its own pictures.
+
+A picture of its camera's shape and another size was resized with all it shows: its camera scales with it. Pictures
+whose sizes differ by a few percent, as COLMAP's undistorter leaves them, are cropped to one size, and their principal
+points move with the corner. A picture of any other shape was cropped where nothing says: no camera is right for it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mambaloc.images import CORNER_PX, center_corner
+from mambaloc.importing.capture import Camera
+from mambaloc.importing.undistort.distortion import pinhole_of, sampled_at
+
+Size = tuple[int, int]
+"""Width and height, in pixels."""
+
+Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+_NEAR = 0.05
+_MAPS_KEPT = 4  # of cameras, at a time: each is as large as a few images
+
+
+class FittedCameras:
+    """A capture's cameras, each fitted to the sizes of its own pictures."""
+
+    def __init__(self, told: Mapping[str, Camera]) -> None:
+        self.told = told
+        self.found: dict[tuple[str, Size], tuple[Camera, Camera] | None] = {}
+        self.maps = lru_cache(_MAPS_KEPT)(self._maps)
+        self.lock = Lock()  # the first images of a camera all ask for its maps
+
+    def size(self, name: str) -> Size:
+        """Of the pictures that a camera is told for."""
+        return self.told[name].width, self.told[name].height
+
+    def fitted(self, name: str, size: Size) -> tuple[Camera, Maps | None] | None:
+        """The lens in pixels of a picture of that size, and maps that undistort it; None where the shapes differ."""
+        with self.lock:
+            if (name, size) not in self.found:
+                lens = fitted(self.told[name], size)
+                self.found[name, size] = None if lens is None else (lens, pinhole_of(name, lens))
+            found = self.found[name, size]
+            return found and (found[0], self.maps(name, size))
+
+    def as_used(
+        self, camera_of: Sequence[str] | None, sizes: Sequence[Size], common: Mapping[Size, Size]
+    ) -> tuple[tuple[str, ...] | None, dict[str, Camera], dict[str, Camera]]:
+        """The name of each picture's camera, and the pinholes and the lenses that these names mean.
+
+        A camera of pictures of several sizes is as many; all but that of most pictures are named by their size, too.
+
+        Args:
+            camera_of: the name of each picture's camera in the capture; None where it has none.
+            sizes: of each picture, as it was fitted.
+            common: what each size is cropped to.
+        """
+        if camera_of is None:
+            return None, {}, {}
+        names: dict[tuple[str, Size], str] = {}
+        for (name, size), _ in Counter(zip(camera_of, sizes, strict=True)).most_common():
+            names[name, size] = name if name not in names.values() else f"{name}-{size[0]}x{size[1]}"
+        pinholes, lenses = {}, {}
+        for (name, size), new in sorted(names.items()):
+            found = self.found[name, size]
+            assert found is not None
+            lenses[new], pinholes[new] = found[0], cropped(found[1], common[size])
+        used = tuple(names[pair] for pair in zip(camera_of, sizes, strict=True))
+        return used, pinholes, lenses
+
+    def _maps(self, name: str, size: Size) -> Maps | None:
+        found = self.found[name, size]
+        return None if found is None or found[0].distorted is None else sampled_at(*found)
+
+
+def is_same_shape(size: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether one scale leads from a size to another, each of whose sides may be rounded by less than a pixel."""
+    apart = abs(other[0] / size[0] - other[1] / size[1])
+    return apart < 1 / size[0] + 1 / size[1]
+
+
+def fitted(camera: Camera, size: Size) -> Camera | None:
+    """A camera in pixels of its picture of a size (width, height); None where that is of another shape."""
+    own = camera.width, camera.height
+    if size == own:
+        return camera
+    return scaled(camera, size) if is_same_shape(own, size) else None
+
+
+def scaled(camera: Camera, size: Size) -> Camera:
+    """A camera in pixels of its pictures resized to (width, height), each side by itself, as COLMAP does."""
+    scale = np.array(size) / (camera.width, camera.height)
+    lens = camera.distorted
+
+    def distorted(rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        assert lens is not None
+        return (lens(rays) + CORNER_PX) * scale - CORNER_PX
+
+    fx, fy = (np.array(camera.focal_px) * scale).tolist()
+    cx, cy = ((np.array(camera.centre_px) + CORNER_PX) * scale - CORNER_PX).tolist()
+    width, height = size
+    return replace(
+        camera, width=width, height=height, focal_px=(fx, fy), centre_px=(cx, cy), distorted=lens and distorted
+    )
+
+
+def cropped(pinhole: Camera, size: Size) -> Camera:
+    """A pinhole of the middle of its pictures, of a size (width, height)."""
+    width, height = size
+    top, left = center_corner((pinhole.height, pinhole.width), (height, width))
+    cx, cy = pinhole.centre_px
+    return replace(pinhole, width=width, height=height, centre_px=(cx - left, cy - top))
+
+
+def common_sizes(sizes: Iterable[Size]) -> dict[Size, Size]:
+    """What pictures of each size are cropped to: the largest that all sizes near it hold.
+
+    A size is near another where both sides differ by a few percent. Of several, it joins the one of most pictures.
+    """
+    counts = Counter(sizes)
+    groups: dict[Size, list[Size]] = {}
+    for size in sorted(counts, key=lambda size: (-counts[size], size)):
+        most = next((other for other in groups if _is_near(size, other)), size)
+        groups.setdefault(most, []).append(size)
+    found = {}
+    for group in groups.values():
+        width, height = min(width for width, _ in group), min(height for _, height in group)
+        found.update(dict.fromkeys(group, (width, height)))
+    return found
+
+
+def _is_near(size: Size, other: Size) -> bool:
+    return all(abs(a - b) <= _NEAR * b for a, b in zip(size, other, strict=True))

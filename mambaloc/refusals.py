@@ -1,0 +1,61 @@
+"""What jsonargparse and Lightning refuse of a command, in one line."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+from typing import NoReturn
+
+from lightning.pytorch.cli import LightningArgumentParser
+
+from mambaloc.errors import InputError
+from mambaloc.models import list_models
+from mambaloc.models.registry import model_class
+
+
+class OneLineErrorParser(LightningArgumentParser):
+    """Parser that answers a wrong option in one line, without its page of usage."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Raise what is wrong as an :class:`~mambaloc.errors.InputError`."""
+        chatter = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
+        lines = [line.strip() for line in str(message).splitlines()]
+        said = " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(chatter))
+        unknown = re.search(r"Expected a dot import path string: (\w+)", said)
+        if unknown and '"model' in said:
+            systems = [model_class(name).__name__ for name in list_models()]
+            near = get_close_matches(unknown[1], systems, n=3, cutoff=0.4) or systems
+            raise InputError(f"model.class_path {unknown[1]}: there is none; did you mean {', '.join(near)}?")
+        remedy = "; --help lists the options"  # a subcommand's parser reports to its parent, which reports again
+        raise InputError(said.replace("typing.", "").removesuffix(remedy) + remedy)
+
+
+@contextmanager
+def tell_refusals(argv: list[str]) -> Iterator[None]:
+    """Tell what Lightning itself refuses in the block, such as a trainer's option, in one line.
+
+    Args:
+        argv: the command's words, of which the option is named.
+
+    Raises:
+        InputError: for an error that Lightning's own code raises. What looks like a mistake in a program is raised as
+            it is.
+    """
+    try:
+        yield
+    except (LookupError, AttributeError, AssertionError, NameError):
+        raise
+    except Exception as error:
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        if frame.f_globals.get("__name__", "").partition(".")[0] not in ("lightning", "lightning_utilities"):
+            raise
+        reason, line = " ".join(str(error).split()), traceback.extract_tb(error.__traceback__)[-1].line
+        options = [word[2:].partition("=")[0] for word in argv if word.startswith("--") and "." in word]
+        named = [name for name in options if name.partition(".")[2].rstrip("+") in f"{reason} {line}"]
+        raise InputError(
+            f"{', '.join(named) or 'trainer'}: Lightning refuses it ({type(error).__name__}: {reason[:400]}). "
+            "Correct it, or leave it out."
+        ) from error

@@ -1,0 +1,100 @@
+"""Files of a pose a line, told by their lines: read as they say, or refused with what to do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from recorded import FRAMES
+
+from mambaloc.importing.formats.timing import picture_stamps, stamps_of
+from mambaloc.importing.registry import read_capture
+
+
+def write(recording, folder, lines, name="poses.txt", names=None):
+    names = names or [f"{row:03d}.jpg" for row in range(FRAMES)]
+    recording.write(folder / "images", names)
+    (folder / name).write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def sevens(recording, order):
+    """Lines of positions and quaternions, in an order of their letters: t, and w and v of the quaternion."""
+    for position, (x, y, z, w) in zip(recording.position_m, recording.xyzw, strict=True):
+        parts = {"t": position, "v": (x, y, z), "w": (w,)}
+        yield " ".join(f"{number:.12f}" for letter in order for number in parts[letter])
+
+
+@pytest.mark.parametrize("name", ["trajectory.txt", "any.log"])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_sixteen_numbers_are_read_by_rows_or_columns(recording, tmp_path, name, transposed):
+    matrices = recording.world_from_cam.swapaxes(1, 2) if transposed else recording.world_from_cam
+    lines = [" ".join(map(repr, matrix.ravel().tolist())) for matrix in matrices]
+    capture = read_capture(write(recording, tmp_path, lines, name))
+    assert (capture.kind, capture.unit) == ("pose_lines", "unknown")
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-9)
+
+
+def test_a_direction_may_be_named(recording, tmp_path):
+    lines = [" ".join(map(repr, matrix.ravel().tolist())) for matrix in np.linalg.inv(recording.world_from_cam)]
+    capture = read_capture(write(recording, tmp_path, lines), "pose_lines_cam_from_world")
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-9)
+
+
+@pytest.mark.parametrize(("header", "order"), [("x y z qw qx qy qz", "twv"), ("x y z qx qy qz qw", "tvw")])
+def test_a_header_says_where_the_scalar_is(recording, tmp_path, header, order):
+    lines = [f"{row:03d}.jpg {line}" for row, line in enumerate(sevens(recording, order))]
+    capture = read_capture(write(recording, tmp_path, [f"# image {header}", *lines]))
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-9)
+
+
+def test_a_trajectorys_header_may_put_the_scalar_first(recording, tmp_path):
+    stamps = [f"{1403636579 + row / 10:.6f}" for row in range(FRAMES)]
+    lines = [f"{stamp} {line}" for stamp, line in zip(stamps, sevens(recording, "twv"), strict=True)]
+    source = write(
+        recording, tmp_path, ["# timestamp tx ty tz qw qx qy qz", *lines], "run.tum", [f"{s}.jpg" for s in stamps]
+    )
+    np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("order", "named", "says"),
+    [
+        ("twv", True, "do not say where the scalar of their quaternions is. Write a table poses.csv"),
+        ("tvw", False, "has 7 numbers a line, which do not say whose pose each is. Write a table poses.csv"),
+    ],
+)
+def test_lines_that_say_too_little_are_refused_with_what_to_do(recording, tmp_path, refused, order, named, says):
+    lines = [f"{row:03d}.jpg {line}" if named else line for row, line in enumerate(sevens(recording, order))]
+    refused(read_capture, write(recording, tmp_path, lines), says)
+
+
+def test_two_files_of_poses_are_ambiguous(recording, tmp_path, refused):
+    lines = [" ".join(map(repr, matrix.ravel().tolist())) for matrix in recording.world_from_cam]
+    write(recording, tmp_path, lines, "a.txt")
+    refused(read_capture, write(recording, tmp_path, lines, "b.txt"), "holds a.txt and b.txt; give the one to read")
+    assert read_capture(tmp_path / "a.txt").kind == "pose_lines"
+
+
+@pytest.mark.parametrize(
+    ("word", "unit", "ns"),
+    [
+        ("1403636579.763555584", "s", 1403636579763555584),
+        ("1403636579763", "ms", 1403636579763000000),
+        ("1403636579763555", "us", 1403636579763555000),
+        ("1403636579763555584.000000", "ns", 1403636579763555584),
+        ("1.403636579763555584e+18", "ns", 1403636579763555584),
+    ],
+)
+def test_the_unit_of_times_since_1970_is_their_size(word, unit, ns):
+    stamps = stamps_of([word])
+    assert (stamps.unit, stamps.ns.tolist()) == (unit, [ns])
+
+
+@pytest.mark.parametrize("words", [["1_5"], ["nan", "1"], ["x"], ["1e99"], []])
+def test_words_that_are_no_times(words):
+    assert stamps_of(words) is None
+
+
+def test_pictures_that_are_counted_have_no_times(tmp_path):
+    assert picture_stamps([tmp_path / f"{row:06d}.jpg" for row in range(9)]) is None
+    assert picture_stamps([tmp_path / f"{row * 33333}.jpg" for row in range(9)]).unit == "us"
