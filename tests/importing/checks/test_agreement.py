@@ -160,7 +160,7 @@ def test_too_few_matches_are_no_evidence():
     few = Agreement(dict.fromkeys(CONVENTIONS, 0.0), 12, 3, [], np.zeros(len(FOCALS)), 100.0, False)
     (finding,) = check_agreement(few)
     assert finding.said == "not compared: 12 matches on 3 pairs of images"
-    assert not finding.concern
+    assert finding.concern.startswith("nothing could be compared: 12 matches")
 
 
 def test_the_share_by_baseline(written, matches):
