@@ -150,6 +150,12 @@ def _contradiction(found: Agreement) -> str:
             f"the pictures fit {order.name} better: {order.share:.0%} of matches agree, {order.as_read:.0%} as they "
             "were read; correct the time stamps, or the order of the files"
         )
+    if found.is_guessed and max(share, float(found.focal_share.max())) < _AGREE:
+        return (
+            f"only {share:.0%} of matches between images agree with the poses, and no focal length makes more of them "
+            "agree than chance: the poses may be inaccurate, of other images, or meant otherwise than they were read; "
+            "compare choices with how the file was written"
+        )
     if share < _AGREE and not found.is_guessed and not found.is_of_another_lens:
         return (
             f"only {share:.0%} of matches between images agree with the poses: these may be inaccurate, or of other "

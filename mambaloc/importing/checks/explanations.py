@@ -17,10 +17,26 @@ from numpy.typing import NDArray
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
 from mambaloc.importing.checks.epipolar import agrees
 from mambaloc.importing.checks.matching import Matches
+from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix
 from mambaloc.text import natural
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
+
+
+def _with_other_scalar(rolled: int) -> Callable[[Floats], Floats]:
+    """What poses were, if the four numbers of their quaternions are taken in another order."""
+
+    def meant(poses: Floats) -> Floats:
+        quaternions = np.roll(quaternion_from_matrix(poses[:, :3, :3]), rolled, axis=1)
+        others = poses.copy()
+        others[:, :3, :3] = matrix_from_quaternion(quaternions)
+        return others
+
+    return meant
+
+
+_FIRST, _LAST = _with_other_scalar(-1), _with_other_scalar(1)
 
 AS_READ = "as they were read"
 CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
@@ -28,6 +44,10 @@ CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
     "world to camera": np.linalg.inv,
     "camera to world in OpenGL's axes": lambda poses: poses @ OPENCV_FROM_OPENGL,
     "world to camera in OpenGL's axes": lambda poses: np.linalg.inv(poses) @ OPENCV_FROM_OPENGL,
+    "camera to world with the quaternions' scalar first": _FIRST,
+    "camera to world with the quaternions' scalar last": _LAST,
+    "world to camera with the quaternions' scalar first": lambda poses: np.linalg.inv(_FIRST(np.linalg.inv(poses))),
+    "world to camera with the quaternions' scalar last": lambda poses: np.linalg.inv(_LAST(np.linalg.inv(poses))),
 }
 """What makes ``world_from_cam`` in OpenCV's axes of poses that were meant otherwise."""
 

@@ -200,8 +200,10 @@ def _numbers(file: Path) -> Matrices:
 
 
 def _read_matrices(files: list[Path]) -> tuple[Matrices, bool]:
-    """Transforms of files, (N, 4, 4), and whether they are written column after column."""
+    """Transforms of files, (N, 4, 4), NaN of empty ones, and whether they are written column after column."""
     values = [_numbers(file) for file in files]
+    usual = next((len(numbers) for numbers in values if len(numbers)), 0)
+    values = [numbers if len(numbers) else np.full(usual, np.nan) for numbers in values]
     for file, numbers in zip(files, values, strict=True):
         if len(numbers) == 7:
             raise InputError(f"{file}: has 7 numbers, which do not say in which order a quaternion has them. {_TABLE}")

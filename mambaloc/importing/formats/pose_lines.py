@@ -152,6 +152,8 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capt
 def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tuple[Matrices, dict[str, str]]:
     """Poses of a position and a quaternion, and what was decided of them."""
     comes_first = layout.quaternion == 0
+    if layout.is_unclear:
+        raise InputError(f"{table.path}: its header does not say where the scalar of the quaternions is. {_TABLE}")
     if (comes_first and not layout.is_text) or (not comes_first and layout.scalar is None):
         raise InputError(
             f"{table.path}: its lines do not say {'in which direction' if comes_first else 'where'} "

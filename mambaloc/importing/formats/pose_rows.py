@@ -55,13 +55,31 @@ class Layout:
     @property
     def scalar(self) -> str | None:
         """Whether the header puts the quaternion's scalar ``first`` or ``last``; None where it does not say."""
-        of = [next((at for at, word in enumerate(self.header) if word in names), None) for names in _SCALARS]
-        if of[0] is None or of[1] is None:
-            return None
-        return "first" if of[0] < of[1] else "last"
+        at = [place for place, name in enumerate(self._of_quaternion) if name.endswith("w")]
+        return {0: "first", 3: "last"}.get(at[0]) if len(at) == 1 else None
 
+    @property
+    def is_unclear(self) -> bool:
+        """Whether a header names the columns, but not the quaternion's in a way that is known."""
+        of_position = self._columns[self._start :][:3] if self.quaternion else self._columns[self._start + 4 :]
+        named = len(of_position) == 3 and all(
+            name.endswith(axis) for name, axis in zip(of_position, "xyz", strict=True)
+        )
+        return named and self.scalar is None
 
-_SCALARS = (("qw", "q_w", "rw"), ("qx", "q_x", "rx"))
+    @property
+    def _start(self) -> int:
+        return int(self.is_named)
+
+    @property
+    def _columns(self) -> tuple[str, ...]:
+        """The header's names of columns, without units in brackets; empty where there are not as many."""
+        names = tuple(word for word in self.header if not word.startswith(("[", "(")))
+        return names if len(names) == self.count + self._start else ()
+
+    @property
+    def _of_quaternion(self) -> tuple[str, ...]:
+        return self._columns[self._start + self.quaternion :][:4]
 
 
 def split_line(line: str) -> tuple[str, list[str]]:
@@ -155,7 +173,7 @@ def pose_files(folder: Path) -> dict[Path, Layout]:
 
 
 def read_rows(path: Path, layout: Layout, row: str) -> Table:
-    """Read a file whose lines are of a layout; rows of NaN, infinity and zeros are kept.
+    """Read a file whose lines are of a layout; rows of NaN, infinity and zeros are kept; a name alone is NaN.
 
     Args:
         path: the file.
@@ -175,6 +193,8 @@ def read_rows(path: Path, layout: Layout, row: str) -> Table:
     for place, (number, line) in enumerate(lines):
         name, words = split_line(line)
         values = as_numbers(words if layout.is_named else [name, *words])
+        if layout.is_named and not words and at > 0:  # a tracker's line without a pose
+            values = np.full(layout.count, np.nan)
         if values is None or len(values) != layout.count:
             if at == 0 and place < min(_HEADERS, len(lines) - 1):  # names of columns
                 continue

@@ -89,6 +89,11 @@ def _read_trajectory(path: Path) -> tuple[Table, Layout]:
     layout = layout_of(path) or Layout(is_named=True, is_text=False, count=7)
     if (layout.is_named, layout.count, layout.quaternion) != (True, 7, 3):
         raise InputError(f"{path}: does not have lines {_ROW!r}. Leave --format out, and its lines tell what it is.")
+    if layout.is_unclear:
+        raise InputError(
+            f"{path}: its header does not say where the scalar of the quaternions is. Name the columns in it: {_ROW}, "
+            "or qw before qx if the scalar comes first."
+        )
     return read_rows(path, layout, _ROW), layout
 
 

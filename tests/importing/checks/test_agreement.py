@@ -94,7 +94,19 @@ MEANT = {
     "world to camera": np.linalg.inv,
     "camera to world in OpenGL's axes": lambda pose: pose @ FLIP,
     "world to camera in OpenGL's axes": lambda pose: np.linalg.inv(pose @ FLIP),
+    "camera to world with the quaternions' scalar first": lambda pose: reordered(pose, 1),
+    "camera to world with the quaternions' scalar last": lambda pose: reordered(pose, -1),
+    "world to camera with the quaternions' scalar first": lambda pose: np.linalg.inv(reordered(np.linalg.inv(pose), 1)),
+    "world to camera with the quaternions' scalar last": lambda pose: np.linalg.inv(reordered(np.linalg.inv(pose), -1)),
 }
+
+
+def reordered(pose, places):
+    """A pose whose quaternion, x y z w, is read with its numbers moved by so many places."""
+    read = pose.copy()
+    xyzw = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    read[:3, :3] = Rotation.from_quat(np.roll(xyzw, places)).as_matrix()
+    return read
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -154,6 +166,11 @@ def test_pictures_without_camera_are_compared_with_a_guess(written):
     findings = checked(replace(written, cameras={}, camera_of=None))
     assert "focal length guessed" in findings[0].said
     assert not any(finding.concern for finding in findings)
+
+
+def test_poses_of_no_camera_are_a_concern_without_one(written):
+    capture = replace(written, cameras={}, camera_of=None, world_from_cam=np.roll(written.world_from_cam, 20, axis=0))
+    assert "no focal length makes more of them agree than chance" in checked(capture)[0].concern
 
 
 def test_too_few_matches_are_no_evidence():

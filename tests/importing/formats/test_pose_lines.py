@@ -56,6 +56,43 @@ def test_a_trajectorys_header_may_put_the_scalar_first(recording, tmp_path):
     np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
 
 
+EUROC = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+
+
+@pytest.mark.parametrize(
+    ("header", "order"),
+    [
+        (EUROC, "twv"),
+        ("# timestamp tx ty tz w x y z", "twv"),
+        ("#time x y z w i j k", "twv"),
+        ("# timestamp tx ty tz q_x q_y q_z q_w", "tvw"),
+        ("# ground truth trajectory, made by my own tool", "tvw"),
+        ("# file: 'room.bag'", "tvw"),
+    ],
+)
+def test_headers_of_trajectories_as_programs_write_them(recording, tmp_path, header, order):
+    stamps = [f"{1403636579 + row / 10:.6f}" for row in range(FRAMES)]
+    lines = [f"{stamp} {line}" for stamp, line in zip(stamps, sevens(recording, order), strict=True)]
+    source = write(recording, tmp_path, [header, *lines], "trajectory.txt", [f"{s}.jpg" for s in stamps])
+    np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
+
+
+@pytest.mark.parametrize("named", ["123456.000", "a.jpg"])
+def test_a_header_that_names_columns_must_say_where_the_scalar_is(recording, tmp_path, refused, named):
+    stamps = [f"{1403636579 + row / 10:.6f}{'.jpg' * (named == 'a.jpg')}" for row in range(FRAMES)]
+    lines = [f"{stamp} {line}" for stamp, line in zip(stamps, sevens(recording, "tvw"), strict=True)]
+    source = write(recording, tmp_path, ["# time px py pz q0 q1 q2 q3", *lines], "poses.txt")
+    refused(read_capture, source, "its header does not say where the scalar of the quaternions is")
+
+
+def test_a_time_stamp_alone_is_a_frame_without_a_pose(recording, tmp_path):
+    stamps = [f"{1403636579 + row / 10:.6f}" for row in range(FRAMES)]
+    lines = [f"{stamp} {line}" for stamp, line in zip(stamps, sevens(recording, "tvw"), strict=True)]
+    source = write(recording, tmp_path, [*lines[:3], stamps[3], *lines[4:]], "run.tum", [f"{s}.jpg" for s in stamps])
+    is_lost = np.isnan(read_capture(source).world_from_cam).any(axis=(1, 2))
+    np.testing.assert_array_equal(np.flatnonzero(is_lost), [3])
+
+
 @pytest.mark.parametrize(
     ("order", "named", "says"),
     [
@@ -66,6 +103,15 @@ def test_a_trajectorys_header_may_put_the_scalar_first(recording, tmp_path):
 def test_lines_that_say_too_little_are_refused_with_what_to_do(recording, tmp_path, refused, order, named, says):
     lines = [f"{row:03d}.jpg {line}" if named else line for row, line in enumerate(sevens(recording, order))]
     refused(read_capture, write(recording, tmp_path, lines), says)
+
+
+def test_an_empty_pose_file_is_a_frame_without_a_pose(recording, tmp_path):
+    recording.write(tmp_path, [f"{row:03d}.jpg" for row in range(FRAMES)])
+    for row, pose in enumerate(recording.world_from_cam):
+        (tmp_path / f"{row:03d}.txt").write_text("" if row == 2 else " ".join(map(repr, pose.ravel().tolist())))
+    capture = read_capture(tmp_path)
+    assert capture.kind == "pose_files"
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(capture.world_from_cam).any(axis=(1, 2))), [2])
 
 
 def test_two_files_of_poses_are_ambiguous(recording, tmp_path, refused):
