@@ -56,7 +56,7 @@ def scene(inputs):
 
 
 def decode(inputs, out):
-    cached_frames(sorted((inputs / "scenes/heads").glob("*/*.png")), 24, BadFrames(), out / "cache")
+    cached_frames(sorted((inputs / "scenes/heads").glob("*/*.color.png")), 24, BadFrames(), out / "cache")
 
 
 def check_cache(out):

@@ -7,7 +7,7 @@ beside ``frames``, and marks frames that are blurred or in shadow ``is_bad`` (gi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from mambaloc.errors import InputError
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture
 from mambaloc.importing.formats.finding import find_pictures
+from mambaloc.importing.formats.listed_splits import given_split
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
 from mambaloc.importing.formats.parsing import pictures_beside, read_object
 from mambaloc.runtime.rotations import is_rotation
@@ -72,19 +73,19 @@ def read(source: Path, images: Path | None = None) -> Capture:
         raise InputError(f"{source}: holds none of {', '.join(FILES)}; give a folder that does")
     contents = {file: _content(file) for file in (files[:1] if files[0].name == "transforms.json" else files)}
     frames = [frame for file, content in contents.items() for frame in _frames(file, content)]
-    lists = [entry for file, content in contents.items() for entry in _lists(file, content)]
+    given, said = given_split([frame.name for frame in frames], _lists(contents))
     folder = files[0].parent if images is None else images
-    named = [(frame.name, f"{frame.where}: file_path") for frame in frames]
-    found = find_pictures(folder, [*named, *((name, where) for _, name, where in lists)])
-    split_of = {file: split for file, (split, _, _) in zip(found.files[len(frames) :], lists, strict=True)}
-    pairs = sorted(zip(found.files, frames, strict=False), key=lambda pair: (natural(pair[0].parent), natural(pair[0])))
+    found = find_pictures(folder, [(frame.name, f"{frame.where}: file_path") for frame in frames])
+    if given:
+        frames = [replace(frame, split=given.get(row) or frame.split or "unused") for row, frame in enumerate(frames)]
+    pairs = sorted(zip(found.files, frames, strict=True), key=lambda pair: (natural(pair[0].parent), natural(pair[0])))
     there = [(image, frame) for image, frame in pairs if image not in found.missing]
     good = [(image, frame) for image, frame in there if not frame.is_bad]
     cameras, names, decided = read_cameras(
         [frame.intrinsics for _, frame in good], [image for image, _ in good], files[0]
     )
     posed = [
-        Posed(image, _sequence(image, folder), frame.world_from_cam, name, split=_split(image, frame, split_of))
+        Posed(image, _sequence(image, folder), frame.world_from_cam, name, split=frame.split)
         for (image, frame), name in zip(good, names, strict=True)
     ]
     choices = _choices(files[0].name, contents[files[0]], [file.name for file in files if file not in contents])
@@ -93,7 +94,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         files[0],
         posed,
         unit="unknown",
-        choices={**choices, "cameras": decided, **found.choices},
+        choices={**choices, "cameras": decided, **said, **found.choices},
         cameras=cameras,
         missing=[image.relative_to(folder).as_posix() for image, _ in pairs if image in found.missing],
         beside=pictures_beside(image for image, _ in pairs),
@@ -120,7 +121,9 @@ def _frames(file: Path, content: dict[str, Any]) -> Iterator[_Frame]:
     for count, frame in enumerate((*content["frames"], *test), start=1):
         is_test = count > len(content["frames"])
         where = f"{file}, test frame {count - len(content['frames'])}" if is_test else f"{file}, frame {count}"
-        world_from_cam = _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix") @ OPENCV_FROM_OPENGL
+        rows = frame.get("transform_matrix")
+        lost = np.full((4, 4), np.nan)  # a tracker's frame without a pose
+        world_from_cam = lost if rows is None else _matrix(rows, f"{where}: transform_matrix") @ OPENCV_FROM_OPENGL
         world_from_cam[:3, 3] /= scale
         yield _Frame(
             where,
@@ -132,17 +135,16 @@ def _frames(file: Path, content: dict[str, Any]) -> Iterator[_Frame]:
         )
 
 
-def _lists(file: Path, content: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
-    """Split, name and place of each image of ``train_filenames`` and its like."""
-    for key in _LISTS:
-        names = content.get(key) or []
-        if not isinstance(names, list):
-            raise InputError(f"{file}: {key} is no list; correct it, or remove it")
-        yield from ((key.removesuffix("_filenames"), name, f"{file}: {key}") for name in names)
-
-
-def _split(image: Path, frame: _Frame, split_of: Mapping[Path, str]) -> str | None:
-    return split_of.get(image) or frame.split or ("unused" if split_of else None)
+def _lists(contents: Mapping[Path, dict[str, Any]]) -> dict[str, list[str]]:
+    """The names in ``train_filenames`` and its like, by split."""
+    lists: dict[str, list[str]] = {}
+    for file, content in contents.items():
+        for key in _LISTS:
+            names = content.get(key) or []
+            if not isinstance(names, list):
+                raise InputError(f"{file}: {key} is no list; correct it, or remove it")
+            lists.setdefault(key.removesuffix("_filenames"), []).extend(map(str, names))
+    return lists
 
 
 def _sequence(image: Path, folder: Path) -> str:
