@@ -60,18 +60,19 @@ class Localiser:
     @property
     def scene(self) -> str:
         """Name of the place, as the network's contract has it, or the map alone."""
-        if self._network is not None:
-            return self._network.contract.scene
-        assert self._map is not None  # one of the two is there
-        return self._map.map.scene
+        return self._place.scene
 
     @property
     def world(self) -> World:
         """Where the scene's frame lies in the world that answers are in: that of the data it was made of."""
+        return self._place.world
+
+    @property
+    def _place(self) -> Contract | SparseMap:
         if self._network is not None:
-            return self._network.contract.world
+            return self._network.contract
         assert self._map is not None  # one of the two is there
-        return self._map.map.world
+        return self._map.map
 
     def localise(self, image: str | Path | Image, intrinsics: ArrayLike | None = None) -> Localisation:
         """Localise one image, in the world of the data that the scene was made of.

@@ -248,8 +248,7 @@ def _by_time(path: Path, rows: list[Row], columns: _Columns, given: Path | None)
     images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, [row[str(columns.time)] for _, row in rows], path)
     name = folder_name(path.parent)
-    times_s = [None] * len(images) if pairing.time_s is None else pairing.time_s.tolist()
-    frames = [(images[place], name, row, times_s[place]) for place, row in pairing.pairs]
+    frames = [(image, name, row, time_s) for image, row, time_s in pairing.frames]
     return _Pictured(sorted(frames, key=lambda frame: frame[3] or 0.0), pairing.how, pairing.missing)
 
 

@@ -82,7 +82,7 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
             f"{root}: has no image with a pose; {len(named)} are named and missing, such as {named[0][0][-60:]!r}. Put "
             f"them there. {_GIVE_ELSE}"
         )
-    absent = {row: direct[row] or root / _parts(named[row][0])[-1] for row in lost if files[row] is None}
+    absent = {row: direct[row] or root / path_parts(named[row][0])[-1] for row in lost if files[row] is None}
     every = tuple(file or absent[row] for row, file in enumerate(files))
     return Found(every, frozenset(absent.values()), _said(root, named, every, [row for row in lost if files[row]]))
 
@@ -100,14 +100,14 @@ def _by_tails(
             raise InputError(
                 f"{where}: names {str(name)[:60]!r}, which is no file inside of {root}; write the picture's path there"
             )
-    tails, least = _Tails(root), 1 if len({_parts(name)[:-1] for name, _ in named}) == 1 else 2
-    found = [tails.find(_parts(name), least, name, where) for name, where in lost]
+    tails, least = _Tails(root), 1 if len({path_parts(name)[:-1] for name, _ in named}) == 1 else 2
+    found = [tails.find(path_parts(name), least, name, where) for name, where in lost]
     return [None if file in taken else file for file in found]
 
 
 def _is_possible(root: Path, name: str) -> bool:
     """Whether a file may have the name of a path, with a suffix if it lacks one."""
-    longest = "/".join(_parts(name))
+    longest = "/".join(path_parts(name))
     longest += max(map(len, PICTURES)) * "_" if longest and not _has_suffix(longest) else ""
     return path_inside(root, longest) is not None
 
@@ -120,7 +120,7 @@ def _said(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], m
     return f"{len(moved)} of {len(named)} by the ends of their paths: {name[-60:]!r} is {place}"
 
 
-def _parts(name: str) -> Parts:
+def path_parts(name: str) -> Parts:
     """The parts of a path of any system, without its drive, ``.`` and what leads up before it."""
     path = PurePosixPath(name.replace("\\", "/"))
     parts = [part for part in path.parts if part not in ("/", "//", ".")]

@@ -8,6 +8,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from mambaloc.images import PICTURES
+from mambaloc.importing.formats.finding import path_parts
 
 _SHOWN = 3  # names in a line
 
@@ -70,6 +71,6 @@ def _row(parts: tuple[str, ...], rows_of: Mapping[tuple[str, ...], list[int]], n
 
 def _parts(name: Any) -> tuple[str, ...]:
     """A path's parts, without a picture's suffix, as frames may lack it."""
-    path = PurePosixPath(str(name).replace("\\", "/"))
-    parts = path.with_suffix("").parts if path.suffix.lower() in PICTURES else path.parts
-    return tuple(part for part in parts if part != "..")
+    *folders, file = path_parts(str(name)) or ("",)
+    path = PurePosixPath(file)
+    return *folders, path.stem if path.suffix.lower() in PICTURES else file

@@ -194,8 +194,7 @@ def _pictures_of(path: Path, table: Table) -> tuple[list[tuple[Path, int, float 
         return [(file, row, None) for row, file in enumerate(files) if file.is_file()], "by name", missing
     images = pictures(first_with_pictures([path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, table.words, path)
-    times_s = [None] * len(images) if pairing.time_s is None else pairing.time_s.tolist()
-    return [(images[i], row, times_s[i]) for i, row in pairing.pairs], pairing.how, pairing.missing
+    return pairing.frames, pairing.how, pairing.missing
 
 
 def _sequence(image: Path, root: Path) -> str:

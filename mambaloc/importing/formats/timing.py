@@ -132,16 +132,14 @@ class Pairing:
     """Which pose is which picture's.
 
     Args:
-        pairs: of a picture's place and its pose's row.
+        frames: each picture that has a pose, the row of that, and the picture's time; None where names are no times.
         how: it was found, for ``choices``.
         missing: names of poses whose picture is not there.
-        time_s: of each picture; None where names are no times.
     """
 
-    pairs: list[tuple[int, int]]
+    frames: list[tuple[Path, int, float | None]]
     how: str
     missing: list[str]
-    time_s: NDArray[np.float64] | None
 
 
 def pair(images: Sequence[Path], words: Sequence[str], listing: Path) -> Pairing:
@@ -156,9 +154,9 @@ def pair(images: Sequence[Path], words: Sequence[str], listing: Path) -> Pairing
         InputError: where names do not tell which pose is which picture's.
     """
     named, stamps = _by_name(images, words), picture_stamps(images)
-    time_s = None if stamps is None else stamps.seconds
     if named is not None:
-        return Pairing(*named, time_s)
+        pairs, how, missing = named
+        return Pairing(_frames(images, stamps, pairs), how, missing)
     if stamps is None:
         raise InputError(
             f"{listing}: does not tell which pose is which image's: {images[0].name!r} is neither a time stamp such "
@@ -166,7 +164,14 @@ def pair(images: Sequence[Path], words: Sequence[str], listing: Path) -> Pairing
             f"lines 'timestamp file' to {listing.with_name('rgb.txt')} and call the trajectory groundtruth.txt."
         )
     pairs, how = by_time(images[0].parent, stamps, words, listing)
-    return Pairing(pairs, f"{how}; pictures are named in {stamps.unit}", [], time_s)
+    return Pairing(_frames(images, stamps, pairs), f"{how}; pictures are named in {stamps.unit}", [])
+
+
+def _frames(
+    images: Sequence[Path], stamps: Stamps | None, pairs: Sequence[tuple[int, int]]
+) -> list[tuple[Path, int, float | None]]:
+    times_s = [None] * len(images) if stamps is None else stamps.seconds.tolist()
+    return [(images[place], row, times_s[place]) for place, row in pairs]
 
 
 def by_time(named: Path, stamps: Stamps, words: Sequence[str], listing: Path) -> tuple[list[tuple[int, int]], str]:

@@ -80,9 +80,7 @@ def read_tum(source: Path) -> Capture:
     table, layout = _read_trajectory(found[0])
     images = pictures(first_with_pictures([found[0].parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, table.words, table.path)
-    times_s = [None] * len(images) if pairing.time_s is None else pairing.time_s.tolist()
-    rows = [(images[i], j, times_s[i]) for i, j in pairing.pairs]
-    return _capture("tum", found[0].parent, (table, layout), rows, pairing.how, pairing.missing, images)
+    return _capture("tum", found[0].parent, (table, layout), pairing.frames, pairing.how, pairing.missing, images)
 
 
 def _read_trajectory(path: Path) -> tuple[Table, Layout]:
