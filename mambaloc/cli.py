@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,15 @@ class SaveRecipe(SaveConfigCallback):
 
 
 class RecipeCLI(LightningCLI):
-    """LightningCLI whose runs each get a folder, and end with the test errors of the best and the last epoch."""
+    """LightningCLI whose runs each get a folder, and end with the test errors of the best and the last epoch.
+
+    Args:
+        began_s: reading of ``time.monotonic()`` from which a time budget counts; now unless given.
+    """
+
+    def __init__(self, *args: Any, began_s: float | None = None, **kwargs: Any) -> None:
+        self.began_s = time.monotonic() if began_s is None else began_s
+        super().__init__(*args, **kwargs)
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Give every run its callbacks, each a section of the recipe."""
@@ -130,6 +139,12 @@ class RecipeCLI(LightningCLI):
         if config.get("enable_progress_bar") is False:
             callbacks = [each for each in callbacks if not isinstance(each, PoseProgressBar)]
         return super()._instantiate_trainer(config, [MovedRun(), *callbacks])
+
+    def before_fit(self) -> None:
+        """Let a time budget begin where the command began."""
+        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+            if isinstance(callback, TimeBudget):
+                callback.began_s = self.began_s
 
     def fit(self, model: L.LightningModule, **kwargs: Any) -> None:
         """Train; an interrupted run says how to go on.
@@ -226,14 +241,20 @@ def recipe_arguments(argv: list[str]) -> list[str]:
 
 
 @exits_cleanly
-def main(argv: list[str] | None = None) -> RecipeCLI:
-    """Run ``tools/train.py``."""
+def main(argv: list[str] | None = None, began_s: float | None = None) -> RecipeCLI:
+    """Run ``tools/train.py``.
+
+    Args:
+        argv: what follows the command's name; that of this process unless given.
+        began_s: as :class:`RecipeCLI` takes it.
+    """
     quieten()
     argv = sys.argv[1:] if argv is None else argv
     with tell_refusals(argv):
         return RecipeCLI(
             LitPoseRegressor,
             PoseDataModule,
+            began_s=began_s,
             parser_class=OneLineErrorParser,
             subclass_mode_model=True,
             auto_configure_optimizers=False,
