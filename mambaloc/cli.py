@@ -37,6 +37,7 @@ from mambaloc.evaluation import evaluate_checkpoint, measure_map_of_run, print_t
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.files import read_yaml, writing
 from mambaloc.models import Checkpoint, LitPoseRegressor
+from mambaloc.recipes import recipe_path
 from mambaloc.refusals import OneLineErrorParser, tell_refusals
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
@@ -216,7 +217,9 @@ def run_directory(config: Namespace) -> Path:
 
 
 def recipe_arguments(argv: list[str]) -> list[str]:
-    """Turn ``[SUBCOMMAND] RECIPE.yaml [OVERLAY.yaml ...] [--key value ...]`` into LightningCLI's own arguments.
+    """Turn ``[SUBCOMMAND] RECIPE [OVERLAY ...] [--key value ...]`` into LightningCLI's own arguments.
+
+    Recipes are files, or names of those that come with the package.
 
     Raises:
         InputError: where no recipe comes first, or one does not exist.
@@ -225,15 +228,14 @@ def recipe_arguments(argv: list[str]) -> list[str]:
     if words and words[0] in ("-h", "--help"):
         return [subcommand, "--help"]
     recipes = []
-    while words and words[0].endswith((".yaml", ".yml")):
-        if not Path(words[0]).is_file():
-            raise InputError(f"{words[0]}: no such recipe; see recipes/")
-        read_yaml(Path(words[0]), "see recipes/", "correct it")  # before a parser that expands whatever stands there
-        recipes += ["--config", words[0]]
+    while words and not words[0].startswith("-"):
+        recipe = recipe_path(words[0])
+        read_yaml(recipe, "see recipes/", "correct it")  # before a parser that expands whatever stands there
+        recipes += ["--config", str(recipe)]
         words = words[1:]
     if not recipes:
         given = f"before {argv[0]}" if argv else ""
-        raise InputError(f"a recipe comes first{', ' + given if given else ''}: train.py RECIPE.yaml [--key value ...]")
+        raise InputError(f"a recipe comes first{', ' + given if given else ''}: train RECIPE [--key value ...]")
     stray = next((word for word in words if word.endswith((".yaml", ".yml")) and Path(word).is_file()), None)
     if stray and words[words.index(stray) - 1 if words.index(stray) else 0] != "--config":
         raise InputError(f"{stray}: recipes and overlays come before the options; move it to the front")
@@ -242,7 +244,7 @@ def recipe_arguments(argv: list[str]) -> list[str]:
 
 @exits_cleanly
 def main(argv: list[str] | None = None, began_s: float | None = None) -> RecipeCLI:
-    """Run ``tools/train.py``.
+    """Run ``mambaloc train``.
 
     Args:
         argv: what follows the command's name; that of this process unless given.
