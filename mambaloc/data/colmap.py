@@ -23,6 +23,7 @@ _RECORDS = {
     "points3D.bin": (43, False, "<Q", 8),
     "frames.bin": (64, False, "<I", 16),
 }
+_CAMERA = 24  # bytes, of a record in cameras.bin before its parameters
 _SENSOR, _POSE = 8, 56  # bytes, of a record in rigs.bin
 
 
@@ -63,7 +64,7 @@ def load_colmap(path: Path) -> Any:
         InputError: without pycolmap, or for a model that is damaged.
     """
     pycolmap = import_pycolmap(path)
-    for name in ("images.bin", "points3D.bin", "frames.bin", "rigs.bin"):
+    for name in ("cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"):  # all before COLMAP reads any
         if (path / name).is_file() and not _is_whole(name, (path / name).read_bytes()):
             raise InputError(f"{path / name}: is cut off or counts more than it holds; export the model again")
     with readable(path) as (folder, names):
@@ -77,9 +78,6 @@ def load_colmap(path: Path) -> Any:
             reason = lines[0].replace(str(folder), str(path))[:200]
             message = f"{path}: is no COLMAP model that pycolmap can read ({reason}); export it again or remove it"
             raise InputError(message) from None
-    cameras, read = path / "cameras.bin", 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
-    if cameras.is_file() and cameras.stat().st_size < read:  # COLMAP fills up what is missing
-        raise InputError(f"{cameras}: is cut off or counts more than it holds; export the model again")
     return model
 
 
@@ -121,7 +119,7 @@ def _is_whole(name: str, data: bytes) -> bool:
         (records,) = struct.unpack_from("<Q", data)
         at = 8
         for _ in range(records):
-            at = _end_of_rig(data, at) if name == "rigs.bin" else _end_of_record(data, at, *_RECORDS[name])
+            at = _ENDS[name](data, at) if name in _ENDS else _end_of_record(data, at, *_RECORDS[name])
     except (struct.error, ValueError, OverflowError):
         return False
     return at <= len(data)
@@ -134,6 +132,15 @@ def _end_of_record(data: bytes, at: int, fixed: int, is_named: bool, count: str,
     return at + struct.calcsize(count) + item * int(items)
 
 
+def _end_of_camera(data: bytes, at: int) -> int:
+    """The camera's number, its model, its size, and as many parameters as pycolmap says that the model has."""
+    import pycolmap
+
+    (model,) = struct.unpack_from("<4xi", data, at)
+    example = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
+    return at + _CAMERA + 8 * len(example.params)
+
+
 def _end_of_rig(data: bytes, at: int) -> int:
     """The rig's number, how many sensors it has, the first one, and each other with its pose or without."""
     (sensors,) = struct.unpack_from("<4xI", data, at)
@@ -142,3 +149,6 @@ def _end_of_rig(data: bytes, at: int) -> int:
         (has_pose,) = struct.unpack_from("<?", data, at + _SENSOR)
         at += _SENSOR + 1 + _POSE * has_pose
     return at
+
+
+_ENDS = {"cameras.bin": _end_of_camera, "rigs.bin": _end_of_rig}

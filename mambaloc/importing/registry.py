@@ -19,6 +19,7 @@ from mambaloc.importing.formats import (
     pose_folders,
     pose_lines,
     seven_scenes,
+    stray_scanner,
     tum,
 )
 from mambaloc.importing.sfm import structure
@@ -50,6 +51,11 @@ FORMATS: dict[str, Format] = {
     "nerfstudio": Format("transforms.json of nerfstudio or instant-ngp", nerfstudio.matches, nerfstudio.read, True),
     "record3d": Format("metadata and rgbd/ of Record3D", arkit.is_record3d, arkit.read_record3d),
     "polycam": Format("keyframes/cameras/ and images/ of Polycam", arkit.is_polycam, arkit.read_polycam),
+    "stray_scanner": Format(
+        "rgb.mp4, odometry.csv and camera_matrix.csv of Stray Scanner",
+        stray_scanner.is_stray_scanner,
+        stray_scanner.read_stray_scanner,
+    ),
     "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd),
     "kitti": Format("poses/ and sequences/", kitti.is_kitti, kitti.read_kitti),
     "7scenes": Format(

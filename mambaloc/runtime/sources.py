@@ -5,14 +5,16 @@ from __future__ import annotations
 import itertools
 import math
 import time
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import PICTURES, Counts, Image, is_picture, pictures, read_image
+from mambaloc.runtime.mp4 import read_about
 
 PICTURES_HZ = 30.0
 """The rate at which a folder's pictures are taken to follow one another, as their files do not say it."""
@@ -34,15 +36,19 @@ class SourceFrame:
 
 
 def frames_of(
-    source: str | Path, pictures_hz: float = PICTURES_HZ, counts: Counts | None = None
+    source: str | Path, pictures_hz: float = PICTURES_HZ, counts: Counts | None = None, is_upright: bool = True
 ) -> tuple[Iterator[SourceFrame], int | None]:
-    """Open a source; return its frames, and how many there are where that is known.
+    """Open a source; return its frames, and about how many there are where that is known.
+
+    A film's number is what its file says, less what it is trimmed by; those that are read may be fewer. A film with a
+    high dynamic range is an :class:`~mambaloc.errors.InputWarning`.
 
     Args:
         source: a video file, a picture, a folder of pictures (in natural order of their names), or the number of a
             camera, where no file or folder has that name.
         pictures_hz: frames per second of a folder of pictures; a video and a camera have their own times.
         counts: black and white of 16-bit pictures, as :func:`~mambaloc.images.read_image` takes them.
+        is_upright: turn a film's frames as the film asks; otherwise they are as it stores them.
 
     Raises:
         InputError: where there is no such source, it is empty, or ``pictures_hz`` is not positive.
@@ -62,7 +68,19 @@ def frames_of(
     if is_picture(path):  # else FFmpeg would take one tile of a phone's HEIC for a film
         return _of_pictures([path], pictures_hz, counts), 1
     capture = _opened(str(path), str(path))
+    if not is_upright:
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    about = read_about(path)
+    if about.hdr:
+        warnings.warn(
+            f"{path}: is a film with a high dynamic range ({about.hdr}), whose frames look flat beside other pictures. "
+            "Record with HDR off, or convert it to SDR, and use such films alone for training and localising.",
+            InputWarning,
+            stacklevel=2,
+        )
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    if about.shown_s is not None:  # a trimmed film counts frames that it does not show
+        count = min(count, round(about.shown_s * capture.get(cv2.CAP_PROP_FPS)))
     return _of_capture(capture), count if count > 0 else None
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from decimal import Decimal
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,29 @@ def decimal(number: float) -> str:
     return f"{number:.9g}" if abs(number) < 1000 else f"{number:.6f}"
 
 
-def write_tum(path: Path, time_s: Iterable[float], position_m: Any, quaternion: Any) -> None:
-    """Write lines ``timestamp tx ty tz qx qy qz qw``, of arrays or tensors (N, 3) and (N, 4) wxyz, all or none of them.
+def stamp(time_s: float | Decimal) -> str:
+    """A time to the nanosecond, so that clock times differ where frames do; a whole number as it is."""
+    return str(time_s) if isinstance(time_s, int) else f"{time_s:.9f}"
 
-    TUM puts the scalar last, unlike everything else here. Positions are written in the world that they are given in.
+
+def write_tum(path: Path, time_s: Iterable[float | Decimal], position_m: Any, quaternion: Any) -> None:
+    """Write lines ``timestamp tx ty tz qx qy qz qw``, all or none of them.
+
+    TUM puts the scalar last, unlike everything else here. Rows without a pose, of zeros or NaN, are left out: evo takes
+    zeros for a pose at the origin. Positions are written in the world that they are given in.
+
+    Args:
+        path: the file.
+        time_s: a pose's time each, to the nanosecond: seconds as a float, which has 0.2 us at today's times, or as a
+            :class:`~decimal.Decimal`, which has all; or indices, as integers.
+        position_m: (N, 3).
+        quaternion: (N, 4), unit, wxyz; nine digits are kept, where evo refuses rotations of six.
 
     Raises:
         InputError: where the file cannot be written.
     """
     rows = zip(time_s, position_m.tolist(), quaternion.tolist(), strict=True)
-    lines = [" ".join(decimal(n) for n in (t, *xyz, qx, qy, qz, qw)) for t, xyz, (qw, qx, qy, qz) in rows]
+    posed = (row for row in rows if any(row[2]) and all(map(isfinite, (*row[1], *row[2]))))
+    lines = [" ".join([stamp(t), *map(decimal, (*xyz, qx, qy, qz, qw))]) for t, xyz, (qw, qx, qy, qz) in posed]
     with writing(path), whole_file(path) as partial:
         partial.write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n", encoding="utf-8")

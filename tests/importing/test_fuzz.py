@@ -8,7 +8,9 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -193,15 +195,18 @@ def colmap(recording, tmp_path_factory):
 @KEPT
 @given(data=st.data())
 def test_damaged_colmap_models(colmap, binary, file, data):
+    """Binary files meet our guard alone: nothing damaged is handed to COLMAP, which believes what they count."""
     folder, whole = colmap[binary]
+    loaded = mock.patch("pycolmap.Reconstruction", side_effect=RuntimeError("whole, but not loaded here"))
     name = f"{file}.{'bin' if binary else 'txt'}"
     try:
         (folder / name).write_bytes(data.draw(st.one_of(damaged(whole[name]), st.binary(max_size=200))))
-        check_reading("colmap", folder)
+        with loaded if binary else nullcontext():
+            check_reading("colmap", folder)
     finally:
         (folder / name).write_bytes(whole[name])
 
 
 def test_no_text_format_is_left_out():
     named = {name for name in FORMATS if name.endswith(("_world_from_cam", "_cam_from_world"))}
-    assert set(SOURCES) == set(FORMATS) - named - {"colmap", "structure_from_motion", "nerfstudio"}
+    assert set(SOURCES) == set(FORMATS) - named - {"colmap", "structure_from_motion", "stray_scanner", "nerfstudio"}

@@ -12,6 +12,14 @@ MATRIX = "1 0 0 2 0 1 0 3 0 0 1 4 0 0 0 1"
 FILES = {
     "record3d": ["metadata", "rgbd/0.jpg", "rgbd/0.depth"],
     "polycam": ["keyframes/cameras/1.json", "keyframes/images/1.jpg", "mesh_info.json", "polycam.mp4"],
+    "stray_scanner": [
+        "rgb.mp4",
+        "odometry.csv",
+        "camera_matrix.csv",
+        "imu.csv",
+        "depth/000000.png",
+        "confidence/000000.png",
+    ],
     "tum_rgbd": ["rgb.txt", "depth.txt", "groundtruth.txt", "accelerometer.txt", "rgb/1.2.png"],
     "kitti": ["poses/00.txt", "sequences/00/image_2/000000.png", "sequences/00/calib.txt"],
     "7scenes": ["TrainSplit.txt", "TestSplit.txt", "seq-01/frame-000000.color.png", "seq-01/frame-000000.pose.txt"],

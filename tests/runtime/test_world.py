@@ -38,7 +38,9 @@ def test_a_localiser_answers_in_the_sources_world():
 
 def test_a_trajectory_keeps_millimetres(tmp_path):
     write_tum(tmp_path / "a.tum", [0.5], np.array([[441548.2072, 5121946.5531, 346.5648]]), np.array([[1.0, 0, 0, 0]]))
-    assert (tmp_path / "a.tum").read_text().splitlines()[1] == ("0.5 441548.207200 5121946.553100 346.5648 0 0 0 1")
+    assert (tmp_path / "a.tum").read_text().splitlines()[1] == (
+        "0.500000000 441548.207200 5121946.553100 346.5648 0 0 0 1"
+    )
 
 
 def test_a_contract_carries_it_and_older_ones_have_none():

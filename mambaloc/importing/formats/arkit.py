@@ -71,7 +71,7 @@ def read_record3d(source: Path) -> Capture:
     folder = first_with_pictures([source / "rgbd", source / "rgb"])
     images = pictures(folder)
     numbered = {number_of(image): image for image in images}
-    names, cameras = _told_apart(_record3d_cameras(metadata, path, len(rows)))
+    names, cameras = told_apart(_record3d_cameras(metadata, path, len(rows)))
     stamps = metadata.get("frameTimestamps")
     times = [None] * len(rows) if stamps is None else array_of(stamps, (len(rows),), "frameTimestamps", path).tolist()
     sequence = folder_name(source)
@@ -106,7 +106,7 @@ def read_polycam(source: Path) -> Capture:
     images = {image.stem: image for image in pictures(folders[1])}
     sequence, present = folder_name(source), [file for file in files if file.stem in images]
     read = [_polycam_frame(file, images[file.stem]) for file in present]
-    names, cameras = _told_apart([camera for _, camera in read])
+    names, cameras = told_apart([camera for _, camera in read])
     stamps = all(number_of(file) >= 0 for file in present)
     posed = [
         Posed(images[file.stem], sequence, pose, name, number_of(file) / 1e6 if stamps else None)
@@ -140,7 +140,7 @@ def _record3d_cameras(metadata: dict[str, object], path: Path, count: int) -> li
     return [pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path) for fx, fy, cx, cy in rows.tolist()]
 
 
-def _told_apart(cameras: list[Camera]) -> tuple[list[str], dict[str, Camera]]:
+def told_apart(cameras: list[Camera]) -> tuple[list[str], dict[str, Camera]]:
     """A name for each camera, the same for equal ones, and the cameras by name."""
     names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras))}
     return [names[camera] for camera in cameras], {name: camera for camera, name in names.items()}

@@ -7,14 +7,11 @@ in the user's cache and found again, unless the pictures change.
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-import cv2
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -23,24 +20,22 @@ from mambaloc.data.colmap import import_pycolmap
 from mambaloc.errors import InputError
 from mambaloc.images import Counts, pictures, read_image
 from mambaloc.importing.capture import Capture
+from mambaloc.importing.film import FILMS, Counted, digest_of, write_frames
 from mambaloc.importing.formats.colmap import read_colmap
 from mambaloc.importing.formats.parsing import first_with_pictures, folder_name
-from mambaloc.importing.sfm.frame_choice import choose_frames
-from mambaloc.importing.sfm.reconstruction import NEIGHBOURS, find_features, match_features, place_images, quiet_colmap
+from mambaloc.importing.frame_choice import choose_frames
+from mambaloc.importing.sfm.process import Job, reconstruct
 from mambaloc.importing.sfm.unread import pose_like, warning_of
 from mambaloc.importing.undistort.decoding import choices_of, counts_of
 from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
 from mambaloc.user_cache import made_once
 
-FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
-"""Suffixes of files that are taken for films."""
-
+_NEIGHBOURS = 10  # before and after a film's frame that it is matched with, beside those 2, 4, 8, ... apart
 _VERSION = 1  # of what is kept: another one is made anew
 _MOST_PHOTOGRAPHS = 60  # every pair of so many is matched; a folder of more is taken for a film's frames
 _MOST_FRAMES = 400  # of a film: placing a hundred takes minutes
 _FEWEST_FRAMES = 5
 _LEAST_PLACED = 0.5
-_JPEG_QUALITY = 95
 _ADVICE = (
     "film slowly and sideways rather than turning on the spot, with texture, light and little motion in view, and "
     "return to where you began"
@@ -71,7 +66,8 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
         console = Console(stderr=True, highlight=False)
         console.print(f"{source}: {warning_of(unread)}", markup=False, soft_wrap=True)
     source = source if source.is_file() else first_with_pictures([source, source / "images"])
-    folder = made_once(f"structure/{_digest(source, seed)}", lambda partial: _make(source, partial, threads, seed))
+    digest = digest_of([source] if source.is_file() else pictures(source), _VERSION, seed)
+    folder = made_once(f"structure/{digest}", lambda partial: _make(source, partial, threads, seed))
     note = json.loads((folder / "note.json").read_text(encoding="utf-8"))
     capture = read_colmap(folder)
     placed = set(capture.images)
@@ -88,15 +84,6 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
     )
 
 
-def _digest(source: Path, seed: int) -> str:
-    """Which pictures these are: by place, size and time of change, without reading them."""
-    digest = hashlib.sha256(f"{_VERSION} {seed} ".encode())
-    for path in [source] if source.is_file() else pictures(source):
-        status = path.stat()
-        digest.update(f"{path.resolve()}\0{status.st_size}\0{status.st_mtime_ns}\0".encode(errors="surrogateescape"))
-    return digest.hexdigest()[:16]
-
-
 def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
     """Fill a folder with chosen images, the largest model of them, and a note of what was decided."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -106,27 +93,22 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
         counts = None if source.is_file() else counts_of(pictures(source))
         frames, total = frames_of(source) if source.is_file() else _of_pictures(source, counts)
         is_film = source.is_file() or (total or 0) > _MOST_PHOTOGRAPHS
-        seen = iter(progress.track(frames, total=total, description="Choosing frames"))
-        time_s, sizes = _write(choose_frames(seen) if is_film else seen, images)
+        seen = Counted(progress.track(frames, total=total, description="Choosing frames"))
+        time_s, sizes = write_frames(choose_frames(seen) if is_film else seen, images)
         names = _thinned(images, sorted(time_s))
         if len(names) < _FEWEST_FRAMES:
             few = f"{len(names)} frames that differ, of {_FEWEST_FRAMES} at least"
             raise InputError(f"{source}: shows {few}; {_ADVICE}")
-        with TemporaryDirectory(dir=folder) as work, quiet_colmap(source, _ADVICE):
-            database = Path(work) / "database.db"
-            progress.add_task("Finding features", total=None)
-            find_features(database, images, names, len(sizes) == 1, threads)
-            progress.add_task("Matching frames", total=None)
-            match_features(database, is_film, threads, seed)
-            task = progress.add_task("Placing frames", total=len(names))
-            placed = place_images(database, images, folder / "sparse/0", seed, lambda: progress.advance(task))
+        neighbours = _NEIGHBOURS if is_film else None
+        job = Job(images, names, folder / "sparse/0", len(sizes) == 1, neighbours, threads, seed)
+        placed = reconstruct(job, source, _ADVICE, progress)
     share = f"{placed} of {len(names)} frames"
     if placed < max(_FEWEST_FRAMES, _LEAST_PLACED * len(names)):
         raise InputError(f"{source}: only {share} could be placed, less than {_LEAST_PLACED:.0%}; {_ADVICE}")
-    chosen = f"{len(names)} of {progress.tasks[0].completed:.0f}, by sharpness and movement"
+    chosen = f"{len(names)} of {seen.count}, by sharpness and movement"
     choices = {
         "frames": chosen if is_film else f"all {len(names)} photographs",
-        "matching": f"{NEIGHBOURS} neighbours of each, and farther ones" if is_film else "every pair",
+        "matching": f"{_NEIGHBOURS} neighbours of each, and farther ones" if is_film else "every pair",
         "registered": f"{share} ({placed / len(names):.0%})",
         **choices_of(counts),
     }
@@ -140,18 +122,6 @@ def _of_pictures(folder: Path, counts: Counts | None) -> tuple[Iterator[SourceFr
     return (SourceFrame(str(at), at / PICTURES_HZ, read_image(path, counts)) for at, path in enumerate(paths)), len(
         paths
     )
-
-
-def _write(frames: Iterable[SourceFrame], folder: Path) -> tuple[dict[str, float], set[tuple[int, ...]]]:
-    """Write frames as JPEG, named by their number in the source; their times by name, and their sizes."""
-    time_s, sizes = {}, set()
-    for frame in frames:
-        name = f"{int(frame.name):06d}.jpg"
-        _, data = cv2.imencode(".jpg", frame.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-        (folder / name).write_bytes(data.tobytes())
-        time_s[name] = frame.time_s
-        sizes.add(frame.image.shape[:2])
-    return time_s, sizes
 
 
 def _thinned(folder: Path, names: list[str]) -> list[str]:

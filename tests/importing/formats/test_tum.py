@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from recorded import FRAMES
 
 from mambaloc.importing.formats.timing import associated
 from mambaloc.importing.formats.tum import read_tum, read_tum_rgbd
@@ -176,3 +177,16 @@ def test_two_trajectories_are_ambiguous(recording, tmp_path, refused):
 def test_a_trajectory_without_images(recording, tmp_path, refused):
     (tmp_path / "poses.tum").write_text(trajectory(recording, list("012345")))
     refused(read_tum, tmp_path, "none holds a picture")
+
+
+def test_orb_slam3_writes_nanoseconds_as_doubles(recording, tmp_path):
+    """Guess: its export for EuRoC is in seconds. It is 1e9 times them with '.000000', off by up to 128 ns."""
+    nanoseconds = [1403636579763555584 + k * 50_000_001 for k in range(FRAMES)]
+    recording.write(tmp_path / "images", [f"{ns}.png" for ns in nanoseconds])
+    poses = zip(nanoseconds, recording.position_m, recording.xyzw, strict=True)
+    rows = [f"{1e9 * (ns / 1e9):.6f} " + " ".join(f"{n:.7f}" for n in (*xyz, *turn)) for ns, xyz, turn in poses]
+    assert rows[0].startswith("1403636579763555584.000000 ")
+    (tmp_path / "CameraTrajectory.txt").write_text("\n".join(rows) + "\n")
+    capture = read_capture(tmp_path)
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-6)
+    assert [int(image.stem) for image in capture.images] == nanoseconds

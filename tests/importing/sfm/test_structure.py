@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
+from mambaloc.errors import InputError
+from mambaloc.importing.frame_choice import FAR, NEAR, Reference, choose_frames, sharpness, small_grey
 from mambaloc.importing.registry import read_capture
-from mambaloc.importing.sfm.frame_choice import FAR, NEAR, Reference, choose_frames, sharpness, small_grey
+from mambaloc.importing.sfm import process
+from mambaloc.importing.sfm.process import Job
 from mambaloc.importing.sfm.structure import read_structure
 from mambaloc.rendering import default_intrinsics, furnished_room, render, smooth_trajectory
 from mambaloc.runtime.sources import SourceFrame
@@ -166,6 +173,73 @@ def test_too_few_frames_are_refused_with_advice(tmp_path, refused):
     refused(read_structure, tmp_path, "only 0 of 8 frames could be placed", "sideways")
     (tmp_path / "7.jpg").write_bytes(b"no picture")
     refused(read_structure, tmp_path, "7.jpg: image cannot be decoded")
+
+
+def job_of(folder, names=("0.jpg",)):
+    (folder / "images").mkdir()
+    return Job(folder / "images", names, folder / "out", one_camera=True, neighbours=None, threads=1, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("ends", "says"),
+    [
+        ("print('free(): invalid pointer', file=sys.stderr); os.kill(os.getpid(), 9)", "SIGKILL, free(): invalid"),
+        ("sys.exit(3)", "(exit code 3)"),
+        ("print('*** Aborted at 5', file=sys.stderr); raise OSError('no space')", "exit code 1, OSError: no space"),
+    ],
+)
+def test_a_process_that_ends_is_a_line(tmp_path, monkeypatch, ends, says):
+    """COLMAP's process may end at any step; ours goes on. What ends here is a program of the test's own."""
+    program = tmp_path / "program.py"
+    program.write_text(f'import os, sys; print(\'{{"step": "Matching frames"}}\', flush=True); {ends}')
+    monkeypatch.setattr(process, "_PROGRAM", program)
+    with Progress(disable=True) as progress, pytest.raises(InputError) as caught:
+        process.reconstruct(job_of(tmp_path), tmp_path / "a.mp4", "film slowly", progress)
+    message = str(caught.value)
+    assert says in message
+    assert "ended at 'Matching frames'" in message
+    assert "\n" not in message
+    assert {path.name for path in tmp_path.iterdir()} == {"images", "program.py"}  # its database is gone
+
+
+def test_progress_of_the_process_is_passed_on(tmp_path, monkeypatch):
+    program, line = tmp_path / "program.py", "print(json.dumps({}))\n"
+    told = [{"step": "Placing frames", "of": 3}, {"advance": 1}, {"advance": 1}, {"placed": 2}]
+    program.write_text("import json\n" + "".join(line.format(message) for message in told))
+    monkeypatch.setattr(process, "_PROGRAM", program)
+    with Progress(disable=True) as progress:
+        assert process.reconstruct(job_of(tmp_path), tmp_path, "", progress) == 2
+    assert [(task.description, task.completed, task.total) for task in progress.tasks][1:] == [("Placing frames", 2, 3)]
+
+
+def test_what_colmap_throws_is_passed_on(tmp_path):
+    pytest.importorskip("pycolmap", reason="structure from motion is pycolmap's, the extra [colmap]")
+    job = replace(job_of(tmp_path), seed=-5)  # COLMAP asks for a seed of at least -1
+    with Progress(disable=True) as progress, pytest.raises(InputError, match=r"COLMAP stopped \(.+\); film slowly"):
+        process.reconstruct(job, tmp_path, "film slowly", progress)
+
+
+def test_the_process_holds_no_opencv():
+    """Guess: pycolmap and OpenCV get along. Each holds a copy of zlib: pycolmap 4.2.1 loaded before OpenCV 5.0 ends a
+    process at its next PNG."""
+    pytest.importorskip("pycolmap", reason="structure from motion is pycolmap's, the extra [colmap]")
+    code = (
+        f"import runpy, sys; runpy.run_path({str(process._PROGRAM)!r}); import pycolmap;"
+        "sys.exit(any(name in sys.modules for name in ('cv2', 'mambaloc', 'torch', 'PIL')))"
+    )
+    assert subprocess.run([sys.executable, "-P", "-c", code], check=False).returncode == 0
+
+
+def test_a_model_is_read_with_opencv_loaded_first():
+    """Our own process reads models by pycolmap: OpenCV, which then finds its own zlib, is there before."""
+    pytest.importorskip("pycolmap", reason="models are read by pycolmap, the extra [colmap]")
+    code = (
+        "import sys; from pathlib import Path; from mambaloc.data.colmap import import_pycolmap;"
+        "assert 'cv2' in sys.modules; import_pycolmap(Path('a'));"
+        "import cv2, numpy; print(len(cv2.imencode('.png', numpy.eye(64, dtype=numpy.uint8))[1]) > 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, "True")
 
 
 def test_what_is_no_film(tmp_path, refused):
