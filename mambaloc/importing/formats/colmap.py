@@ -21,11 +21,10 @@ from mambaloc.data.colmap import colmap_models, is_sound, load_colmap
 from mambaloc.data.colmap_text import count_images
 from mambaloc.data.tracks import Tracks
 from mambaloc.errors import InputError
-from mambaloc.files import path_inside
 from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, validate_se3
-from mambaloc.importing.formats.finding import SMALLER, Found, find_pictures
+from mambaloc.importing.formats.finding import SMALLER, Found, count_there, find_pictures
 from mambaloc.importing.formats.parsing import folder_name, pictures_beside
 from mambaloc.text import natural
 
@@ -126,8 +125,7 @@ def _find(source: Path, model: Path, images: Path | None, names: list[str]) -> F
         folders += [root.parent / "images", root.parent.parent / "images"]
     folder, most = images or source, 0
     for candidate in folders if images is None else ():
-        paths = [path_inside(candidate, name) for name in names]
-        count = sum(path is not None and path.is_file() for path in paths)
+        count = count_there(candidate, names)
         folder, most = (candidate, count) if count > most else (folder, most)
         if most == len(names):
             break

@@ -21,11 +21,10 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.files import path_inside
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
-from mambaloc.importing.formats.finding import Found, find_pictures
+from mambaloc.importing.formats.finding import Found, count_there, find_pictures
 from mambaloc.importing.formats.parsing import (
     as_numbers,
     first_with_pictures,
@@ -259,14 +258,8 @@ def _images(path: Path, rows: list[Row], columns: _Columns, given: Path | None) 
     within = [(name.removeprefix(f"{scene}/"), where) for name, scene, where in names]
     root = given or path.parent
     candidates = [(root, whole), (root / "images", whole), (root, within)]
-    folder, named = max(candidates, key=lambda candidate: _count(*candidate))
+    folder, named = max(candidates, key=lambda each: count_there(each[0], [name for name, _ in each[1]]))
     return folder, find_pictures(folder, named)
-
-
-def _count(folder: Path, named: list[tuple[str, str]]) -> int:
-    """How many names are of files in a folder."""
-    paths = (path_inside(folder, name) for name, _ in named)
-    return sum(path is not None and path.is_file() for path in paths)
 
 
 def _split(path: Path, line: int, row: dict[str, str]) -> str | None:
