@@ -89,7 +89,7 @@ def _checked(written: Written, left_out: Mapping[str, str], asked: str, with_adj
         findings += [*check_agreement(agreeing), *_of_poses(capture, motion)]
         if not any(finding.is_fatal for finding in findings):
             proposals = propose(capture, motion)
-            chosen = choose(proposals, asked)
+            chosen = choose(proposals, asked, capture)
             split = chosen.proposal.split
             findings.append(Finding("split", f"by {chosen.proposal.kind}: {chosen.proposal.how}", chosen.warning))
     adjusted = None if agreeing is None else agreeing.adjusted

@@ -124,13 +124,14 @@ def check_sizes(sizes: Sequence[tuple[int, int]]) -> Finding:
 def check_pixels(decoding: Decoding) -> Finding:
     """Say which pixels of a picture with an EXIF orientation its pose means."""
     concern = ""
-    if decoding.oriented and not decoding.upright and not decoding.known:
+    if decoding.stored and not decoding.known:
         concern = (
-            f"{decoding.oriented} pictures have an EXIF orientation, and the format does not say whether poses mean "
+            f"{len(decoding.stored)} pictures have an EXIF orientation, and the format does not say whether poses mean "
             "stored or upright pixels: taken as stored. If they mean upright ones, write the pictures so first, as "
             "mogrify -auto-orient does"
         )
-    return Finding("pixels", decoding.choices()["pixels"], concern, figures={"oriented": decoding.oriented})
+    figures = {"turned": len(decoding.turned), "stored": len(decoding.stored)}
+    return Finding("pixels", decoding.choices()["pixels"], concern, figures=figures)
 
 
 def check_steps(capture: Capture, motion: Motion, unit: str) -> Finding:

@@ -19,6 +19,8 @@ from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quat
 
 Matrices = NDArray[np.float64]
 
+_NONE_LISTED = "a split of its own that names none of the frames that have a pose and a picture"
+
 
 @dataclass(frozen=True)
 class Posed:
@@ -45,6 +47,7 @@ def build_capture(
     beside: Iterable[Path] = (),
     left_out: Mapping[Path, str] | None = None,
     depth_camera: Matrices | None = None,
+    split_concern: str = "",
 ) -> Capture:
     """Make a capture: sequence after sequence, in the order of their first images.
 
@@ -59,6 +62,7 @@ def build_capture(
         beside: images that are there, of which some may be among ``posed``.
         left_out: why images are left out that the format marks as bad.
         depth_camera: (3, 3), in pixels of depth frames, which are in millimetres.
+        split_concern: as of :class:`Capture`.
 
     Raises:
         InputError: for no image, one with two poses, or more than a scene may have.
@@ -99,6 +103,7 @@ def build_capture(
         images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in known),
         left_out={str(image): rule for image, rule in marked.items()},
         depth=None if depth_camera is None else Depth(tuple(each.depth for each in ordered), depth_camera),
+        split_concern=split_concern or (_NONE_LISTED if splits and set(splits) == {"unused"} else ""),
     )
 
 

@@ -216,7 +216,7 @@ class _Tails:
 
 
 def _common(known: Sequence[str], named: Sequence[str]) -> int:
-    """How many folders two paths have in common, from their ends; one of smaller copies counts as that of the others."""
+    """How many folders two paths have in common, from their ends; one of smaller copies counts as the named one."""
     length = 0
     for a, b in zip(map(_folded, reversed(known)), map(_folded, reversed(named)), strict=False):
         if a not in (b, *(b + end for end in SMALLER)):

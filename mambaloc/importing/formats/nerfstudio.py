@@ -73,11 +73,13 @@ def read(source: Path, images: Path | None = None) -> Capture:
         raise InputError(f"{source}: holds none of {', '.join(FILES)}; give a folder that does")
     contents = {file: _content(file) for file in (files[:1] if files[0].name == "transforms.json" else files)}
     frames = [frame for file, content in contents.items() for frame in _frames(file, content)]
-    given, said = given_split([frame.name for frame in frames], _lists(contents))
+    given = given_split([frame.name for frame in frames], _lists(contents))
     folder = files[0].parent if images is None else images
     found = find_pictures(folder, [(frame.name, f"{frame.where}: file_path") for frame in frames])
-    if given:
-        frames = [replace(frame, split=given.get(row) or frame.split or "unused") for row, frame in enumerate(frames)]
+    if given.split:
+        frames = [
+            replace(frame, split=given.split.get(row) or frame.split or "unused") for row, frame in enumerate(frames)
+        ]
     pairs = sorted(zip(found.files, frames, strict=True), key=lambda pair: (natural(pair[0].parent), natural(pair[0])))
     there = [(image, frame) for image, frame in pairs if image not in found.missing]
     good = [(image, frame) for image, frame in there if not frame.is_bad]
@@ -94,10 +96,11 @@ def read(source: Path, images: Path | None = None) -> Capture:
         files[0],
         posed,
         unit="unknown",
-        choices={**choices, "cameras": decided, **said, **found.choices},
+        choices={**choices, "cameras": decided, **given.choices, **found.choices},
         cameras=cameras,
         missing=[image.relative_to(folder).as_posix() for image, _ in pairs if image in found.missing],
         beside=pictures_beside(image for image, _ in pairs),
+        split_concern=given.concern,
         left_out={image: _BAD for image, frame in there if frame.is_bad},
     )
 

@@ -203,6 +203,17 @@ def test_lists_name_frames_as_programs_write_them(write, tmp_path, lists, split,
     assert capture.split == split
     assert capture.choices.get("split", "").startswith(said or "")
     assert ("split" in capture.choices) == (said is not None)
+    assert ("'9.png' is listed, 'i/1.png' is a frame" in capture.split_concern) == ("9.png" in lists["train"])
+
+
+def test_lists_that_name_no_frame_are_stated_with_a_name_of_each_side(write, tmp_path):
+    write(["i/1.png", "i/2.png"], train_filenames=["cam1/a.png"], test_filenames=["cam1/b.png"])
+    capture = read_capture(tmp_path)
+    assert capture.split is None
+    assert (
+        capture.split_concern
+        == "lists of names that are of none of its frames ('cam1/a.png' is listed, 'i/1.png' is a frame)"
+    )
 
 
 def test_a_listed_name_of_two_frames_is_neither(write, tmp_path):
@@ -220,7 +231,9 @@ def test_a_frame_without_a_matrix_has_no_pose(write, tmp_path):
 def test_a_split_of_images_that_are_not_there_is_none(write, tmp_path):
     names = ("images/a_1.png", "images/a_2.png")
     write(names, absent=names[:1], train_filenames=names[:1])
-    assert read_capture(tmp_path).split is None
+    capture = read_capture(tmp_path)
+    assert capture.split is None
+    assert capture.split_concern.startswith("a split of its own that names none of the frames")
 
 
 def test_a_pose_that_is_not_known_stays_for_the_checks(write, tmp_path):
