@@ -63,7 +63,7 @@ def check_frames(capture: Capture, left_out: Mapping[str, str]) -> Finding:
         capture: of those that are left.
         left_out: the rule that others break, by name.
     """
-    kept, rules = len(capture.images), Counter(left_out.values())
+    kept, rules = len(capture.images), Counter(rule.partition(" (")[0] for rule in left_out.values())
     causes = [f"{count} left out: {rule}" for rule, count in rules.most_common()]
     said = "; ".join((f"{kept}", *causes[:_NAMED]))
     figures = {"kept": kept, "left_out": dict(rules)}

@@ -97,10 +97,17 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
     def where(row: int) -> str:
         return f"{path}, line {rows[row][0]}"
 
-    world_from_cam, mended = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), where)
+    checked = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), where)
     pictured = (_by_time if columns.image is None else _by_image)(path, rows, columns, images)
     posed = [
-        Posed(image, sequence, world_from_cam[row], time_s=time_s, split=_split(path, *rows[row]))
+        Posed(
+            image,
+            sequence,
+            checked.poses[row],
+            time_s=time_s,
+            split=_split(path, *rows[row]),
+            fault=checked.faults.get(row, ""),
+        )
         for image, sequence, row, time_s in pictured.frames
     ]
     is_known = columns.position == _POSITIONS[2] or (columns.position == _POSITIONS[0] and "scene" in rows[0][1])
@@ -110,9 +117,8 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
         "scale": "metres, as the datasets have them" if is_known else "unknown: the table does not tell",
         "origin": "kept",
         "association": pictured.how,
+        **checked.choices,
     }
-    if mended:
-        choices["quaternions"] = f"{mended} of {len(rows)} were not of unit length, and made so"
     beside = pictures_beside(each.image for each in posed)
     missing = pictured.missing
     kind = "csv" if direction is None else f"csv_{direction}"

@@ -18,7 +18,15 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, PICTURES, pictures
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole, validate_se3
+from mambaloc.importing.formats.builder import (
+    Checked,
+    Matrices,
+    Posed,
+    build_capture,
+    from_quaternions,
+    pinhole,
+    validate_se3,
+)
 from mambaloc.importing.formats.parsing import (
     Table,
     as_numbers,
@@ -91,18 +99,23 @@ def read_in_order(
             f"{path}: has {len(table.lines)} poses, and {folder} {len(images)} images; give as many, in the same "
             "order, or write each picture's name before its pose"
         )
-    poses = towards_world(_transforms(table, layout), direction)
+    checked = validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
+    poses = towards_world(checked.poses, direction)
     sequence = folder_name(path.parent)
     return build_capture(
         kind,
         path.parent,
-        [Posed(image, sequence, pose) for image, pose in zip(images, poses, strict=True)],
+        [
+            Posed(image, sequence, pose, fault=checked.faults.get(row, ""))
+            for row, (image, pose) in enumerate(zip(images, poses, strict=True))
+        ],
         unit="unknown",
         choices={
             **choices,
             "direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD,
             "scale": _CHOICES["scale"],
             "association": "in the order of file names",
+            **checked.choices,
         },
     )
 
@@ -117,12 +130,13 @@ def _files(source: Path) -> dict[Path, Layout]:
 def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capture:
     table = read_rows(path, layout, f"name and {layout.count} numbers")
     if layout.count == 7:
-        world_from_cam, told = _of_sevens(table, layout, direction)
+        checked, direction, told = _of_sevens(table, layout, direction)
     else:
         direction = direction or "world_from_cam"
-        world_from_cam = towards_world(_transforms(table, layout), direction)
+        checked = validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
         told = {"direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD}
         told |= _by_column(layout)
+    world_from_cam = towards_world(checked.poses, direction)
     rows, how, missing = _pictures_of(path, table)
     cameras = _cameras(path.parent / "intrinsics.txt")
     names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras.values()))}
@@ -134,6 +148,7 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capt
             world_from_cam[row],
             camera_of.get(image.relative_to(path.parent).as_posix()),
             time_s,
+            fault=checked.faults.get(row, ""),
         )
         for image, row, time_s in rows
     ]
@@ -142,15 +157,15 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capt
         path,
         sorted(posed, key=lambda each: each.time_s or 0.0),
         unit="unknown",
-        choices={**_CHOICES, **told, "association": how},
+        choices={**_CHOICES, **told, "association": how, **checked.choices},
         cameras={name: camera for camera, name in names.items()},
         missing=missing,
         beside=pictures_beside(image for image, _, _ in rows),
     )
 
 
-def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tuple[Matrices, dict[str, str]]:
-    """Poses of a position and a quaternion, and what was decided of them."""
+def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tuple[Checked, Direction, dict[str, str]]:
+    """Poses of a position and a quaternion, in which direction they transform, and what was decided of them."""
     comes_first = layout.quaternion == 0
     if layout.is_unclear:
         raise InputError(f"{table.path}: its header does not say where the scalar of the quaternions is. {_TABLE}")
@@ -164,16 +179,10 @@ def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tup
     position = table.numbers[:, 4:] if comes_first else table.numbers[:, :3]
     if scalar == "last":
         quaternion = np.roll(quaternion, 1, axis=1)
-    poses, mended = from_quaternions(position, quaternion, table.where)
+    checked = from_quaternions(position, quaternion, table.where)
     direction = direction or ("cam_from_world" if comes_first else "world_from_cam")
     told = {"direction": f"{_WORLD_FROM_CAM if direction == 'world_from_cam' else _CAM_FROM_WORLD}, scalar {scalar}"}
-    if mended:
-        told["quaternions"] = f"{mended} of {len(table.lines)} were not of unit length, and made so"
-    return towards_world(poses, direction), told
-
-
-def _transforms(table: Table, layout: Layout) -> Matrices:
-    return validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
+    return checked, direction, told
 
 
 def towards_world(poses: Matrices, direction: Direction) -> Matrices:

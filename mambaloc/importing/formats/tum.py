@@ -125,7 +125,7 @@ def _capture(
     table, layout = trajectory
     scalar, said = layout.scalar or "last", "its header says" if layout.scalar else "the format has them"
     quaternion = table.numbers[:, 3:] if scalar == "first" else np.roll(table.numbers[:, 3:], 1, axis=1)
-    world_from_cam, mended = from_quaternions(table.numbers[:, :3], quaternion, table.where)
+    checked = from_quaternions(table.numbers[:, :3], quaternion, table.where)
     unit: Unit = "metre" if kind == "tum_rgbd" else "unknown"
     choices = {
         "axes": "OpenCV camera axes, as the format has them",
@@ -133,11 +133,13 @@ def _capture(
         "scale": "metres, as the benchmark has them" if unit == "metre" else "unknown: a trajectory does not tell",
         "origin": "kept",
         "association": how,
+        **checked.choices,
     }
-    if mended:
-        choices["quaternions"] = f"{mended} of {len(table.lines)} were not of unit length, and made so"
     if all(time_s is not None for _, _, time_s in rows):
         rows = sorted(rows, key=lambda row: row[2] or 0.0)
     sequence = folder_name(source)
-    posed = [Posed(image, sequence, world_from_cam[row], time_s=time_s) for image, row, time_s in rows]
+    posed = [
+        Posed(image, sequence, checked.poses[row], time_s=time_s, fault=checked.faults.get(row, ""))
+        for image, row, time_s in rows
+    ]
     return build_capture(kind, source, posed, unit=unit, choices=choices, missing=missing, beside=beside)

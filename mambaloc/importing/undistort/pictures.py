@@ -116,7 +116,7 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
 def _write(
     source: Path, target: Path, decoding: Decoding, cameras: FittedCameras, name: str | None, crop: Size | None
 ) -> tuple[Size, bool] | str:
-    """Write an image, or the middle of it: its (width, height) and whether it is upright, or the rule that it breaks."""
+    """Write an image, or the middle of it: its (width, height) and whether it is upright, or the rule it breaks."""
     try:
         data = source.read_bytes()
     except OSError:
