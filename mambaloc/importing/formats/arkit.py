@@ -126,7 +126,6 @@ def read_polycam(source: Path) -> Capture:
         )
         for row, file in enumerate(present)
     ]
-    corrected = folders[0].name.startswith("corrected")
     return build_capture(
         "polycam",
         source,
@@ -134,7 +133,7 @@ def read_polycam(source: Path) -> Capture:
         unit="metre",
         choices={
             **_CHOICES,
-            "poses": "optimised by the app" if corrected else "ARKit's own: the app optimised none",
+            "poses": _polycam_poses(folders[0], len(files)),
             **checked.choices,
         },
         cameras=cameras,
@@ -172,6 +171,17 @@ def _polycam_folders(source: Path) -> tuple[Path, Path] | None:
             if cameras.is_dir() and images.is_dir():
                 return cameras, images
     return None
+
+
+def _polycam_poses(cameras: Path, count: int) -> str:
+    """Which of an export's poses were taken, and which were not."""
+    raw, corrected = (cameras.with_name(f"{prefix}cameras") for prefix in ("", "corrected_"))
+    if cameras == corrected:
+        others = sum(not (corrected / file.name).is_file() for file in raw.glob("*.json"))
+        return f"{count} optimised by the app" + (f"; not read: {others} that it did not optimise" if others else "")
+    if corrected.is_dir():
+        return "ARKit's own: corrected_cameras are of corrected_images, which are missing"
+    return "ARKit's own: the app optimised none"
 
 
 def _polycam_frame(path: Path, image: Path) -> tuple[np.ndarray, Camera]:

@@ -18,7 +18,8 @@ from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quat
 
 Matrices = NDArray[np.float64]
 
-_SHORTEST, _LONGEST = 0.5 - 1e-3, 2.0 + 1e-3  # quaternions that are made unit
+SHORTEST, LONGEST = 0.5 - 1e-3, 2.0 + 1e-3
+"""Lengths of quaternions that are made units, and their rounding."""
 _ROUNDED = 1e-6  # of a rotation's entries
 _NONE_LISTED = "a split of its own that names none of the frames that have a pose and a picture"
 
@@ -174,7 +175,7 @@ def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[
     quaternion = np.where(lost[:, None], (1.0, 0.0, 0.0, 0.0), quaternion)
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
-    is_bad = ~((norm >= _SHORTEST) & (norm <= _LONGEST))
+    is_bad = ~((norm >= SHORTEST) & (norm <= LONGEST))
     faults, usable = _faults({"the quaternion is far from unit length": is_bad}, lost, where)
     rotation = matrix_from_quaternion(np.where(usable[:, None], quaternion, (1.0, 0.0, 0.0, 0.0)))
     poses = np.where(usable[:, None, None], rigid_transforms(rotation, position), np.nan)
@@ -190,11 +191,11 @@ def _faults(
     Raises:
         InputError: where all rows that are no marks break one.
     """
-    usable = ~lost
+    usable = np.asarray(~lost)
     faults: dict[int, str] = {}
     for rule, is_bad in rules.items():
         faults |= {row: f"{rule} ({where(row)})" for row in np.flatnonzero(usable & is_bad).tolist()}
-        usable = usable & ~is_bad
+        usable = np.asarray(usable & ~is_bad)
     if faults and not usable.any():
         row = min(faults)
         raise InputError(f"{where(row)}: {faults[row].partition(' (')[0]}; correct or remove it")

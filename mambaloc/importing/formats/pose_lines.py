@@ -27,12 +27,12 @@ from mambaloc.importing.formats.builder import (
     pinhole,
     validate_se3,
 )
+from mambaloc.importing.formats.finding import count_there, find_pictures
 from mambaloc.importing.formats.parsing import (
     Table,
     as_numbers,
     first_with_pictures,
     folder_name,
-    inside,
     pictures_beside,
     read_lines,
 )
@@ -52,12 +52,13 @@ def is_pose_lines(source: Path) -> bool:
     return bool(_files(source))
 
 
-def read_pose_lines(source: Path, direction: Direction | None = None) -> Capture:
+def read_pose_lines(source: Path, direction: Direction | None = None, images: Path | None = None) -> Capture:
     """Read a file of poses.
 
     Args:
         source: the file, or its folder.
         direction: in which its poses transform; as the module says unless given.
+        images: the folder of the images; found beside the file unless given.
 
     Raises:
         InputError: for a file that is damaged, can be read in more ways than one, or does not fit its pictures.
@@ -72,12 +73,17 @@ def read_pose_lines(source: Path, direction: Direction | None = None) -> Capture
         raise InputError(f"{path}: has 7 numbers a line, which do not say whose pose each is. {_TABLE}")
     if not layout.is_named:
         how = {**_CHOICES, **_by_column(layout)}
-        return read_in_order(path, layout, "pose_lines", how, direction or "world_from_cam")
-    return _read_named(path, layout, direction)
+        return read_in_order(path, layout, "pose_lines", how, direction or "world_from_cam", images)
+    return _read_named(path, layout, direction, images)
 
 
 def read_in_order(
-    path: Path, layout: Layout, kind: str, choices: Mapping[str, str], direction: Direction = "world_from_cam"
+    path: Path,
+    layout: Layout,
+    kind: str,
+    choices: Mapping[str, str],
+    direction: Direction = "world_from_cam",
+    given: Path | None = None,
 ) -> Capture:
     """Read matrices without names, which are those of the pictures beside their file, in natural order.
 
@@ -87,12 +93,13 @@ def read_in_order(
         kind: of the capture.
         choices: made so far.
         direction: in which poses transform.
+        given: the folder of the images; found beside the file unless given.
 
     Raises:
         InputError: for a file that is damaged, or another number of pictures.
     """
     table = read_rows(path, layout, " ".join(["number"] * layout.count))
-    folder = first_with_pictures([path.parent / name for name in IMAGE_FOLDERS])
+    folder = first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS])
     images = pictures(folder)
     if len(images) != len(table.lines):
         raise InputError(
@@ -127,7 +134,7 @@ def _files(source: Path) -> dict[Path, Layout]:
     return {} if layout is None else {source: layout}
 
 
-def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capture:
+def _read_named(path: Path, layout: Layout, direction: Direction | None, given: Path | None) -> Capture:
     table = read_rows(path, layout, f"name and {layout.count} numbers")
     if layout.count == 7:
         checked, direction, told = _of_sevens(table, layout, direction)
@@ -137,16 +144,16 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capt
         told = {"direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD}
         told |= _by_column(layout)
     world_from_cam = towards_world(checked.poses, direction)
-    rows, how, missing = _pictures_of(path, table)
+    rows, how, missing = _pictures_of(path, table, given)
     cameras = _cameras(path.parent / "intrinsics.txt")
     names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras.values()))}
     camera_of = {name: names[camera] for name, camera in cameras.items()}
     posed = [
         Posed(
             image,
-            _sequence(image, path.parent),
+            _sequence(image, given or path.parent),
             world_from_cam[row],
-            camera_of.get(image.relative_to(path.parent).as_posix()),
+            camera_of.get(table.words[row].replace("\\", "/")),
             time_s,
             fault=checked.faults.get(row, ""),
         )
@@ -190,18 +197,20 @@ def towards_world(poses: Matrices, direction: Direction) -> Matrices:
     return poses if direction == "world_from_cam" else np.linalg.inv(poses).astype(np.float64)
 
 
-def _pictures_of(path: Path, table: Table) -> tuple[list[tuple[Path, int, float | None]], str, list[str]]:
+def _pictures_of(
+    path: Path, table: Table, given: Path | None
+) -> tuple[list[tuple[Path, int, float | None]], str, list[str]]:
     """Each picture with its row and time, how they were associated, and the names whose pictures are not there."""
+    folders = [given] if given else [path.parent, *(path.parent / name for name in IMAGE_FOLDERS[:-1])]
     if all(PurePosixPath(word).suffix.lower() in PICTURES for word in table.words):
-        root = path.parent
-        places = [
-            [inside(folder, word, table.where(row)) for row, word in enumerate(table.words)]
-            for folder in (root, *(root / name for name in IMAGE_FOLDERS[:-1]))
+        folder = max(folders, key=lambda each: count_there(each, table.words))
+        found = find_pictures(folder, [(word, table.where(row)) for row, word in enumerate(table.words)])
+        missing = [word for word, file in zip(table.words, found.files, strict=True) if file in found.missing]
+        frames: list[tuple[Path, int, float | None]] = [
+            (file, row, None) for row, file in enumerate(found.files) if file not in found.missing
         ]
-        files = max(places, key=lambda each: sum(file.is_file() for file in each))
-        missing = [word for word, file in zip(table.words, files, strict=True) if not file.is_file()]
-        return [(file, row, None) for row, file in enumerate(files) if file.is_file()], "by name", missing
-    images = pictures(first_with_pictures([path.parent / name for name in IMAGE_FOLDERS]))
+        return frames, "; ".join(filter(None, ("by name", found.elsewhere))), missing
+    images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, table.words, path)
     return pairing.frames, pairing.how, pairing.missing
 

@@ -18,11 +18,12 @@ from mambaloc.errors import InputError
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
+from mambaloc.importing.formats.finding import find_pictures
 from mambaloc.importing.formats.parsing import (
     Table,
     first_with_pictures,
     folder_name,
-    inside,
+    pictures_beside,
     read_lines,
 )
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS, Layout, layout_of, pose_files, read_rows
@@ -37,29 +38,35 @@ def is_tum_rgbd(source: Path) -> bool:
     return (source / "rgb.txt").is_file() and (source / "groundtruth.txt").is_file()
 
 
-def read_tum_rgbd(source: Path) -> Capture:
+def read_tum_rgbd(source: Path, images: Path | None = None) -> Capture:
     """Read a recording's ``rgb.txt`` and ``groundtruth.txt``.
+
+    Args:
+        source: the recording's folder.
+        images: the folder of the images that ``rgb.txt`` names; the recording's own unless given.
 
     Raises:
         InputError: for a file that is missing or damaged, or where nothing can be associated.
     """
     listing, (table, layout) = source / "rgb.txt", _read_trajectory(source / "groundtruth.txt")
-    images, words_of, missing = [], [], []
+    named, words_of = [], []
     for line, words in read_lines(listing, "a line each: timestamp file"):
         if len(words) != 2 or stamps_of(words[:1]) is None:
             raise InputError(f"{listing}, line {line}: is no line 'timestamp file'; correct or remove it")
-        image = inside(source, words[1], f"{listing}, line {line}")
-        if image.is_file():
-            images.append(image)
-            words_of.append(words[0])
-        else:
-            missing.append(words[1])
-    stamps = stamps_of(words_of)
+        named.append((words[1], f"{listing}, line {line}"))
+        words_of.append(words[0])
+    if not named:
+        raise InputError(f"{listing}: names no image; add lines 'timestamp file'")
+    found = find_pictures(images or source, named)
+    there = [row for row, file in enumerate(found.files) if file not in found.missing]
+    stamps = stamps_of([words_of[row] for row in there])
     if stamps is None:
-        raise InputError(f"{listing}: names no image that is there, of {len(missing)}; add them")
+        raise InputError(f"{listing}: has time stamps in no unit that is known; correct them")
     pairs, how = by_time(listing, stamps, table.words, table.path)
-    beside = [*images, *pictures(source / "rgb")]
-    rows = [(images[i], j, float(stamps.seconds[i])) for i, j in pairs]
+    how = "; ".join(filter(None, (how, found.elsewhere)))
+    missing = [name for (name, _), file in zip(named, found.files, strict=True) if file in found.missing]
+    beside = pictures_beside(found.files[row] for row in there)
+    rows = [(found.files[there[i]], j, float(stamps.seconds[i])) for i, j in pairs]
     return _capture("tum_rgbd", source, (table, layout), rows, how, missing, beside)
 
 

@@ -79,6 +79,7 @@ def test_pictures_on_their_side():
     for pose, pitch in zip(poses, np.linspace(-60, 60, len(poses)), strict=True):
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("x", pitch, degrees=True).as_matrix()
     assert "lie on their side" in check_up(capture_of(poses), up_of(capture_of(poses))).concern
+    assert not check_up(capture_of(poses), up_of(capture_of(poses)), are_contradicted=True).concern
 
 
 @pytest.mark.parametrize(("inwards", "said"), [(True, "meet in front of"), (False, "meet behind")])

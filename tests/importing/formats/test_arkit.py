@@ -158,8 +158,20 @@ def test_optimised_polycam_poses_are_preferred(polycam, recording, place):
     np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-12)
     np.testing.assert_allclose(capture.time_s, np.array(STAMPS) / 1e6)
     assert {path.parent.name for path in capture.images} == {"corrected_images"}
+    assert capture.choices["poses"] == "6 optimised by the app"
     (camera,) = capture.cameras.values()
     assert (camera.focal_px, camera.centre_px) == ((58, 58), (32.5, 24.5))
+
+
+def test_which_polycam_poses_were_taken_is_stated(polycam, recording):
+    (polycam / "keyframes/corrected_cameras" / f"{STAMPS[3]}.json").unlink()
+    capture = read_polycam(polycam)
+    assert capture.choices["poses"] == "5 optimised by the app; not read: 1 that it did not optimise"
+    np.testing.assert_allclose(capture.world_from_cam, np.delete(recording.world_from_cam, 3, axis=0), atol=1e-12)
+    (polycam / "keyframes/corrected_images").rename(polycam / "hidden")
+    capture = read_polycam(polycam)
+    assert "corrected_images, which are missing" in capture.choices["poses"]
+    np.testing.assert_allclose(capture.world_from_cam[:, 0, 3], recording.position_m[:, 0] + 0.1)
 
 
 def test_arkit_poses_are_taken_where_none_were_optimised(polycam, recording):
