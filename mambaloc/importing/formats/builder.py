@@ -146,7 +146,7 @@ def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Checked:
     lost = is_mark(matrices[:, :3].reshape(-1, 12), matrices[:, :3, :3].reshape(-1, 9))
     matrices = np.where(lost[:, None, None], np.eye(4)[: matrices.shape[1]], matrices)
     rotation, position = matrices[:, :3, :3], matrices[:, :3, 3]
-    rules = {"the pose's rotation is not orthonormal": ~is_rotation(rotation, ROTATION_TOLERANCE)}
+    rules = {"the pose's rotation is not orthonormal": np.asarray(~is_rotation(rotation, ROTATION_TOLERANCE))}
     if matrices.shape[1] == 4:
         is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
         rules["the pose's last row is not 0 0 0 1"] = ~is_last
@@ -191,7 +191,7 @@ def _faults(
     Raises:
         InputError: where all rows that are no marks break one.
     """
-    usable = np.asarray(~lost)
+    usable: NDArray[np.bool_] = ~lost
     faults: dict[int, str] = {}
     for rule, is_bad in rules.items():
         faults |= {row: f"{rule} ({where(row)})" for row in np.flatnonzero(usable & is_bad).tolist()}
