@@ -149,7 +149,7 @@ def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Checked:
     rules = {"the pose's rotation is not orthonormal": np.asarray(~is_rotation(rotation, ROTATION_TOLERANCE))}
     if matrices.shape[1] == 4:
         is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
-        rules["the pose's last row is not 0 0 0 1"] = ~is_last
+        rules["the pose's last row is not 0 0 0 1"] = np.asarray(~is_last)
     faults, usable = _faults(rules, lost, where)
     exact = matrix_from_quaternion(quaternion_from_matrix(np.where(usable[:, None, None], rotation, np.eye(3))))
     off = np.where(usable, np.abs(exact - rotation).max(axis=(1, 2)), 0.0)
