@@ -115,7 +115,7 @@ def beside(drawn: Drawn) -> None:
     style = str(drawn.rng.choice(["7scenes", "X.txt", "X.npy", "folders", "scannet"]))
     for row, stem in enumerate(drawn.names()):
         matrix, stem = drawn.matrix(row), stem.removesuffix(".color")
-        text = "\n".join(line(line) for line in matrix.tolist())
+        text = "\n".join(line(numbers) for numbers in matrix.tolist())
         if style == "X.npy":
             drawn.picture(row, f"seq-01/{stem}.jpg")
             np.save(drawn.folder / f"seq-01/{stem}.npy", matrix)

@@ -221,7 +221,7 @@ def _numbers(path: Path, line: int, row: dict[str, str], columns: _Columns) -> n
     values = as_numbers(["nan" if word.lower() in _NO_FIX else word for word in words])
     if values is None:
         names = ",".join((*columns.position, *columns.quaternion))
-        raise InputError(f"{path}, line {line}: {names} must be numbers; correct or remove the row")
+        raise InputError(f"{path}, line {line}: {names} must be numbers with points; correct or remove the row")
     return values
 
 

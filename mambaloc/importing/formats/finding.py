@@ -7,6 +7,7 @@ looked at, and the search follows no symbolic link.
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,7 @@ from mambaloc.images import PICTURES, pictures
 SMALLER = ("_2", "_4", "_8")
 """What the folders of smaller copies add to a folder's name, the largest first: those of splatting data sets."""
 
+_OTHER = re.compile(r"depth|mask|semantic|label|normal|confidence", re.IGNORECASE)  # folders of no pictures
 _MOST_FILES = 1_000_000
 _LONGEST_NAME = 255  # bytes
 _GIVE = "Give the folder of the pictures with --images."
@@ -199,7 +201,9 @@ class _Tails:
         found: dict[tuple[int, bool], list[Parts]] = defaultdict(list)
         for known in self.known.get(_folded(stem), ()):
             length, is_named = 1 + _common(known[:-1], folders), _folded(known[-1]) in folded
-            if length >= least and (is_named or length > 1 or len(known) == 1):
+            if length == 1 and len(known) > 1 and (not is_named or _OTHER.search(known[-2])):
+                continue
+            if length >= least:
                 found[length, is_named].append(known)
         if not found:
             return None

@@ -75,7 +75,7 @@ class Decoding:
             said.append(f"upright, as the cameras' sizes say: {self._some(self.turned)} were turned")
         if self.stored:
             why = f"as {self.known} reads them" if self.known else "taken so: the format does not say"
-            said.append(f"as stored, {why}: the EXIF orientation of {self._some(self.stored)} was dropped")
+            said.append(f"as stored, {why}; {self._some(self.stored)} have an EXIF orientation, dropped")
         return {"pixels": "; ".join(said) or "as stored; no picture has an EXIF orientation", **choices_of(self.counts)}
 
     def _some(self, paths: Sequence[Path]) -> str:

@@ -211,6 +211,9 @@ def test_a_stem_of_several_pictures_or_of_another_folder_is_not_taken(tmp_path):
     with pytest.raises(InputError, match=r"^\S+: has no image with a pose; 1 are named and missing") as refusal:
         find_pictures(tmp_path, [("images/2.jpg", "here")])
     assert str(refusal.value).count("--images") == 1
+    made(tmp_path, "masks/4.jpg")
+    with pytest.raises(InputError, match=r"has no image with a pose; 1 are named and missing, such as '4\.jpg'"):
+        find_pictures(tmp_path, [("4.jpg", "here")])
     with pytest.raises(InputError, match=r"may be cam/3\.jpg or cam_2/3\.jpg"):
         find_pictures(tmp_path, [("3.jpg", "here")])
 

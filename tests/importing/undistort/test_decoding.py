@@ -99,7 +99,7 @@ def test_pictures_that_were_decided_differently_are_counted_apart(tmp_path):
     assert [Image.open(image).size for image in written.capture.images] == [(32, 24), (24, 32), (32, 24), (24, 32)]
     said = written.capture.choices["pixels"]
     assert "2 of 4 pictures (such as 1.jpg) were turned" in said
-    assert "the EXIF orientation of 1 of 4 pictures (such as 0.jpg) was dropped" in said
+    assert "1 of 4 pictures (such as 0.jpg) have an EXIF orientation, dropped" in said
     assert check_pixels(written.decoding).concern.startswith("1 pictures have an EXIF orientation")
 
 
