@@ -70,6 +70,7 @@ class Capture:
         camera_of: N names, or None where the format tells of none.
         time_s: (N,) where the format tells of it.
         split: N of ``train``, ``val``, ``test`` where the format tells of them.
+        split_concern: what the capture has that gives no split, or only part of one, in a line; empty where nothing.
         poses_without_image: what the format names and is not there.
         images_without_pose: images beside those used.
         left_out: why frames are left out that the format itself marks as bad, by file.
@@ -88,6 +89,7 @@ class Capture:
     camera_of: tuple[str, ...] | None = None
     time_s: NDArray[np.float64] | None = None
     split: tuple[str, ...] | None = None
+    split_concern: str = ""
     poses_without_image: tuple[str, ...] = ()
     images_without_pose: tuple[Path, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)

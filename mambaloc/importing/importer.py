@@ -86,10 +86,10 @@ def _checked(written: Written, left_out: Mapping[str, str], asked: str, with_adj
         motion = motion_of(capture)
         agreeing = agreement(capture, motion, with_adjusted)
         findings += [sanity.check_sizes(written.sizes), sanity.check_pixels(written.decoding)]
-        findings += [*check_agreement(agreeing), *_of_poses(capture, motion)]
+        findings += [*check_agreement(agreeing), *_of_poses(capture, motion, agreeing)]
         if not any(finding.is_fatal for finding in findings):
             proposals = propose(capture, motion)
-            chosen = choose(proposals, asked)
+            chosen = choose(proposals, asked, capture)
             split = chosen.proposal.split
             findings.append(Finding("split", f"by {chosen.proposal.kind}: {chosen.proposal.how}", chosen.warning))
     adjusted = None if agreeing is None else agreeing.adjusted
@@ -107,10 +107,10 @@ def _checked(written: Written, left_out: Mapping[str, str], asked: str, with_adj
     )
 
 
-def _of_poses(capture: Capture, motion: Motion) -> list[Finding]:
+def _of_poses(capture: Capture, motion: Motion, agreeing: Agreement) -> list[Finding]:
     unit = "m" if capture.unit == "metre" else "units"
     return [
-        check_up(capture, up_of(capture)),
+        check_up(capture, up_of(capture), bool(agreeing.contradiction)),
         check_axes(capture),
         sanity.check_extent(capture, motion, unit),
         sanity.check_steps(capture, motion, unit),

@@ -56,7 +56,7 @@ FORMATS: dict[str, Format] = {
         stray_scanner.is_stray_scanner,
         stray_scanner.read_stray_scanner,
     ),
-    "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd),
+    "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd, True),
     "kitti": Format("poses/ and sequences/", kitti.is_kitti, kitti.read_kitti),
     "7scenes": Format(
         "TrainSplit.txt, TestSplit.txt and seq-NN/ of 7-Scenes",
@@ -79,12 +79,13 @@ FORMATS: dict[str, Format] = {
         "lines of a 4x4 matrix, or of a picture's name and a pose, beside images",
         pose_lines.is_pose_lines,
         pose_lines.read_pose_lines,
+        True,
     ),
     "pose_lines_world_from_cam": Format(
-        "the same", _by_name_alone, partial(pose_lines.read_pose_lines, direction="world_from_cam")
+        "the same", _by_name_alone, partial(pose_lines.read_pose_lines, direction="world_from_cam"), True
     ),
     "pose_lines_cam_from_world": Format(
-        "the same", _by_name_alone, partial(pose_lines.read_pose_lines, direction="cam_from_world")
+        "the same", _by_name_alone, partial(pose_lines.read_pose_lines, direction="cam_from_world"), True
     ),
     "pose_files": Format(
         "a pose file beside each picture, as in a sequence of 7-Scenes",

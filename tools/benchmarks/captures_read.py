@@ -9,7 +9,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from captures_written import Drawn, draw
+from captures_drawn import Drawn
+from captures_written import draw
 from scipy.spatial.transform import Rotation
 
 from mambaloc.errors import InputError

@@ -9,106 +9,18 @@ from __future__ import annotations
 import csv
 import io
 import json
+import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
 
-import cv2
 import numpy as np
+from captures_drawn import Drawn, line
 from scipy.spatial.transform import Rotation
 
 GRID_M = (441547.25, 5121947.5, 346.125)
 PER_S = {"s": Decimal(1), "ms": Decimal(10) ** 3, "us": Decimal(10) ** 6, "ns": Decimal(10) ** 9}
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-@dataclass
-class Drawn:
-    """What was drawn of a capture, before it is written in a format.
-
-    Args:
-        folder: to write to.
-        rng: for more draws.
-        poses: true ``world_from_cam``, (N, 4, 4).
-        marks: what a frame has instead of its pose: ``nan``, ``zeros`` or ``origin``; None of most.
-        sizes: (width, height) of each picture.
-        encoding: of texts.
-        newline: of texts.
-        truth: the true pose by the path of its picture, once written; None of frames without a fix.
-        pixels: of each picture, as it is stored.
-    """
-
-    folder: Path
-    rng: np.random.Generator
-    poses: np.ndarray
-    marks: list[str | None]
-    sizes: list[tuple[int, int]]
-    encoding: str
-    newline: str
-    truth: dict[Path, np.ndarray | None] = field(default_factory=dict)
-    pixels: dict[Path, np.ndarray] = field(default_factory=dict)
-
-    def text(self, name: str, content: str) -> None:
-        """Write a text."""
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content.replace("\n", self.newline).encode(self.encoding))
-
-    def picture(self, row: int, name: str) -> None:
-        """Write a frame's picture, perhaps with an orientation tag, and keep what is true of it."""
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        width, height = self.sizes[row]
-        coarse = self.rng.integers(0, 256, (3, 4, 3), dtype=np.uint8)
-        stored = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-        options = [cv2.IMWRITE_JPEG_QUALITY, 98] if path.suffix == ".jpg" else []
-        data = cv2.imencode(path.suffix, stored, options)[1].tobytes()
-        if path.suffix == ".jpg" and self.rng.random() < 0.3:
-            data = _tagged(data, int(self.rng.integers(2, 9)))
-        path.write_bytes(data)
-        self.truth[path] = None if self.marks[row] else self.poses[row]
-        self.pixels[path] = stored
-
-    def matrix(self, row: int, axes: np.ndarray | None = None) -> np.ndarray:
-        """A frame's matrix as a file has it, with its mark."""
-        mark = self.marks[row]
-        if mark == "origin":
-            return np.eye(4)
-        if mark is not None:
-            return np.full((4, 4), np.nan if mark == "nan" else 0.0)
-        return self.poses[row] if axes is None else self.poses[row] @ axes
-
-    def seven(self, row: int) -> tuple[list[float], list[float]]:
-        """A frame's position and quaternion xyzw, with its mark."""
-        mark = self.marks[row]
-        if mark is not None:
-            number = np.nan if mark == "nan" else 0.0
-            return [number] * 3, [0.0, 0.0, 0.0, 1.0] if mark == "origin" else [number] * 4
-        turn = Rotation.from_matrix(self.poses[row, :3, :3]).as_quat()
-        return self.poses[row, :3, 3].tolist(), turn.tolist()
-
-    def words(self, row: int, order: str = "xyzw") -> str:
-        """The seven numbers of a frame."""
-        position, xyzw = self.seven(row)
-        return _line([*position, *(xyzw if order == "xyzw" else [xyzw[3], *xyzw[:3]])])
-
-    def names(self) -> list[str]:
-        """Stems of pictures in order of time, of one kind: padded, unpadded, or with words around."""
-        style = str(self.rng.choice(["{:06d}", "{}", "frame_{}", "IMG {:03d}", "frame-{:06d}.color"]))
-        first = int(self.rng.integers(0, 96))
-        return [style.format(first + row) for row in range(len(self.poses))]
-
-
-def _line(numbers: list[float]) -> str:
-    return " ".join(repr(float(number)) for number in numbers)
-
-
-def _tagged(jpeg: bytes, orientation: int) -> bytes:
-    """A JPEG with an EXIF orientation, 1 to 8, after its first marker."""
-    entry = (0x0112).to_bytes(2, "little") + b"\x03\x00\x01\x00\x00\x00" + orientation.to_bytes(4, "little")
-    exif = b"Exif\x00\x00II*\x00\x08\x00\x00\x00\x01\x00" + entry + b"\x00\x00\x00\x00"
-    return jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
 
 
 def clock(drawn: Drawn) -> tuple[list[str], list[str]]:
@@ -175,7 +87,7 @@ def in_order(drawn: Drawn) -> None:
     """Twelve or sixteen numbers a line, row by row or column by column."""
     rows, by_column = int(drawn.rng.choice([3, 4])), drawn.rng.random() < 0.3
     matrices = [drawn.matrix(row)[:rows] for row in range(len(drawn.poses))]
-    lines = [_line((matrix.T if by_column else matrix).ravel().tolist()) for matrix in matrices]
+    lines = [line((matrix.T if by_column else matrix).ravel().tolist()) for matrix in matrices]
     drawn.text(str(drawn.rng.choice(["poses.txt", "traj.log", "cam2world.txt"])), "\n".join(lines) + "\n")
     for row, stem in enumerate(drawn.names()):
         drawn.picture(row, f"images/{stem}.jpg")
@@ -194,7 +106,7 @@ def named(drawn: Drawn) -> None:
         elif inverse:
             position, xyzw = drawn.seven(row)
             numbers = [xyzw[3], *xyzw[:3], *position]
-        lines.append(f"seq1/{stem}.jpg {_line(numbers)}")
+        lines.append(f"seq1/{stem}.jpg {line(numbers)}")
     drawn.text("poses.txt", "\n".join(lines) + "\n")
 
 
@@ -203,7 +115,7 @@ def beside(drawn: Drawn) -> None:
     style = str(drawn.rng.choice(["7scenes", "X.txt", "X.npy", "folders", "scannet"]))
     for row, stem in enumerate(drawn.names()):
         matrix, stem = drawn.matrix(row), stem.removesuffix(".color")
-        text = "\n".join(_line(line) for line in matrix.tolist())
+        text = "\n".join(line(numbers) for numbers in matrix.tolist())
         if style == "X.npy":
             drawn.picture(row, f"seq-01/{stem}.jpg")
             np.save(drawn.folder / f"seq-01/{stem}.npy", matrix)
@@ -230,8 +142,77 @@ def nerfstudio(drawn: Drawn) -> None:
     drawn.text("transforms.json", json.dumps({"frames": shuffled}))
 
 
+def colmap(drawn: Drawn) -> None:
+    """A model as a text or in binary, a camera a size; COLMAP marks no frames without a fix, it leaves them out."""
+    drawn.marks = [None] * len(drawn.poses)
+    stems, sizes = drawn.names(), sorted(set(drawn.sizes))
+    images = []
+    for row, stem in enumerate(stems):
+        drawn.picture(row, f"images/{stem}.jpg")
+        cam_from_world = np.linalg.inv(drawn.poses[row])
+        turn = np.roll(Rotation.from_matrix(cam_from_world[:3, :3]).as_quat(), 1)
+        numbers = [*turn.tolist(), *cam_from_world[:3, 3].tolist()]
+        images.append((row + 1, numbers, 1 + sizes.index(drawn.sizes[row]), f"{stem}.jpg"))
+    cameras = [(number, *size, *_lens(size)) for number, size in enumerate(sizes, start=1)]
+    model = drawn.folder / str(drawn.rng.choice(["sparse", "sparse/0"]))
+    if drawn.rng.random() < 0.5:
+        name = model.relative_to(drawn.folder).as_posix()
+        told = [f"{number} PINHOLE {w} {h} {line(list(lens))}" for number, w, h, *lens in cameras]
+        drawn.text(f"{name}/cameras.txt", "\n".join(told) + "\n")
+        lines = [f"{number} {line(numbers)} {camera} {file}\n\n" for number, numbers, camera, file in images]
+        drawn.text(f"{name}/images.txt", "# Image list\n" + "".join(lines))
+        drawn.text(f"{name}/points3D.txt", "")
+        return
+    model.mkdir(parents=True)
+    count = struct.Struct("<Q").pack
+    told_bytes = [struct.pack("<IiQQ4d", number, 1, w, h, *lens) for number, w, h, *lens in cameras]
+    (model / "cameras.bin").write_bytes(count(len(cameras)) + b"".join(told_bytes))
+    records = [
+        struct.pack("<I7dI", number, *numbers, camera) + file.encode() + b"\0" + count(0)
+        for number, numbers, camera, file in images
+    ]
+    (model / "images.bin").write_bytes(count(len(images)) + b"".join(records))
+    (model / "points3D.bin").write_bytes(count(0))
+
+
+def polycam(drawn: Drawn) -> None:
+    """Polycam's raw data; optimised cameras beside those of ARKit, which are 10 cm off, or the latter alone."""
+    drawn.marks = [None] * len(drawn.poses)
+    prefix, start = str(drawn.rng.choice(["corrected_", ""])), int(drawn.rng.integers(10**8, 10**9))
+    for row in range(len(drawn.poses)):
+        stamp = start + 250_000 * row
+        drawn.picture(row, f"keyframes/{prefix}images/{stamp}.jpg")
+        width, height = drawn.sizes[row]
+        fx, fy, cx, cy = _lens((width, height))
+        told = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
+        for name, off_m in {"cameras": 0.1 if prefix else 0.0, f"{prefix}cameras": 0.0}.items():
+            matrix = drawn.matrix(row, GL)
+            shifted = {f"t_{i}{j}": matrix[i, j] + off_m * (j == 3) for i in range(3) for j in range(4)}
+            drawn.text(f"keyframes/{name}/{stamp}.json", json.dumps({**told, **shifted}))
+
+
+def record3d(drawn: Drawn) -> None:
+    """A recording of Record3D, of one size or with smaller pictures."""
+    rows = []
+    for row in range(len(drawn.poses)):
+        drawn.picture(row, f"rgbd/{row}.jpg")
+        position, xyzw = drawn.seven(row)
+        if drawn.marks[row] is None:
+            xyzw = Rotation.from_matrix((drawn.poses[row] @ GL)[:3, :3]).as_quat().tolist()
+        rows.append([*xyzw, *position])
+    width, height = max(drawn.sizes)
+    fx, fy, cx, cy = _lens((width, height))
+    told = {"poses": rows, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "w": width, "h": height}
+    drawn.text("metadata", json.dumps(told))
+
+
+def _lens(size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point of pictures of a size, from their corner."""
+    return 0.9 * size[0], 0.9 * size[0], size[0] / 2, size[1] / 2
+
+
 KINDS: tuple[Callable[[Drawn], None], ...] = (
-    tum, tum_rgbd, table_by_time, table, in_order, named, beside, nerfstudio,
+    tum, tum_rgbd, table_by_time, table, in_order, named, beside, nerfstudio, colmap, polycam, record3d,
 )  # fmt: skip
 
 

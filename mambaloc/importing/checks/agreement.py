@@ -73,6 +73,11 @@ class Agreement:
         return best_focal(self.focal_share)
 
     @property
+    def contradiction(self) -> str:
+        """What is wrong with the poses, and what to do, in a line; empty where nothing is known to be."""
+        return _contradiction(self) if self.is_known else ""
+
+    @property
     def is_of_another_lens(self) -> bool:
         """Whether another focal length than the given explains clearly more, and more than another order does."""
         best, given = self.focal_share.max(), self.focal_share[_AS_GIVEN]
@@ -128,7 +133,7 @@ def check_agreement(found: Agreement) -> list[Finding]:
     others = max(share for convention, share in found.share.items() if convention != AS_READ)
     guessed = ", focal length guessed" if found.is_guessed else ""
     said = f"{share:.0%} of {found.matches} matches on {found.pairs} pairs agree{guessed} (otherwise: {others:.0%})"
-    findings = [Finding(name, said, _contradiction(found), figures=figures), _check_focal(found)]
+    findings = [Finding(name, said, found.contradiction, figures=figures), _check_focal(found)]
     if found.depth is not None:
         findings.append(_check_depth(found.depth, found.focal_px))
     if found.adjusted is not None:

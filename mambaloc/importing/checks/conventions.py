@@ -62,8 +62,14 @@ def up_of(capture: Capture) -> Up:
     return Up(direction, common, _AXES[nearest], float(_angle_deg(along[nearest])), spread_deg)
 
 
-def check_up(capture: Capture, up: Up) -> Finding:
-    """Say which way is up, and whether the pictures lie on their side."""
+def check_up(capture: Capture, up: Up, are_contradicted: bool = False) -> Finding:
+    """Say which way is up, and whether the pictures lie on their side.
+
+    Args:
+        capture: of posed images.
+        up: of its cameras.
+        are_contradicted: the pictures contradict the poses, which then say nothing of how the pictures lie.
+    """
     figures = {
         "direction": up.direction.round(4).tolist(),
         "axis": up.axis,
@@ -73,9 +79,10 @@ def check_up(capture: Capture, up: Up) -> Finding:
     }
     sideways = float(np.linalg.norm(capture.world_from_cam[:, :3, 0].mean(axis=0)))
     concern = ""
-    if sideways >= _COMMON and sideways > up.common + _ON_THEIR_SIDE:
+    if sideways >= _COMMON and sideways > up.common + _ON_THEIR_SIDE and not are_contradicted:
         concern = (
-            "the pictures seem to lie on their side: the cameras' x axis, not y, keeps a direction; turn them upright"
+            "the pictures seem to lie on their side: the cameras' x axis, not y, keeps a direction; pictures to "
+            "localise must lie so, too"
         )
     if not up.is_known:
         return Finding(

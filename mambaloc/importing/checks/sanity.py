@@ -21,6 +21,7 @@ _DUPLICATE_SHARE = 1e-6  # of the extent
 _DUPLICATE_DEG = 1e-3
 _MANY = 0.1
 _NAMED = 3
+_LEAST_STILL = 3  # successive frames
 _MUCH = 2.0
 
 
@@ -63,7 +64,7 @@ def check_frames(capture: Capture, left_out: Mapping[str, str]) -> Finding:
         capture: of those that are left.
         left_out: the rule that others break, by name.
     """
-    kept, rules = len(capture.images), Counter(left_out.values())
+    kept, rules = len(capture.images), Counter(rule.partition(" (")[0] for rule in left_out.values())
     causes = [f"{count} left out: {rule}" for rule, count in rules.most_common()]
     said = "; ".join((f"{kept}", *causes[:_NAMED]))
     figures = {"kept": kept, "left_out": dict(rules)}
@@ -124,13 +125,14 @@ def check_sizes(sizes: Sequence[tuple[int, int]]) -> Finding:
 def check_pixels(decoding: Decoding) -> Finding:
     """Say which pixels of a picture with an EXIF orientation its pose means."""
     concern = ""
-    if decoding.oriented and not decoding.upright and not decoding.known:
+    if decoding.stored and not decoding.known:
         concern = (
-            f"{decoding.oriented} pictures have an EXIF orientation, and the format does not say whether poses mean "
+            f"{len(decoding.stored)} pictures have an EXIF orientation, and the format does not say whether poses mean "
             "stored or upright pixels: taken as stored. If they mean upright ones, write the pictures so first, as "
             "mogrify -auto-orient does"
         )
-    return Finding("pixels", decoding.choices()["pixels"], concern, figures={"oriented": decoding.oriented})
+    figures = {"turned": len(decoding.turned), "stored": len(decoding.stored)}
+    return Finding("pixels", decoding.choices()["pixels"], concern, figures=figures)
 
 
 def check_steps(capture: Capture, motion: Motion, unit: str) -> Finding:
@@ -162,14 +164,22 @@ def check_duplicates(capture: Capture, motion: Motion) -> Finding:
         axis=1,
     ).round()
     many = len(grid) - len(np.unique(grid, axis=0))
-    concern = (
-        f"{many} frames have exactly the pose of another: tracking may have stood still"
-        if many > _MANY * len(grid)
-        else ""
-    )
+    run, concern = _longest_run(grid, capture.sequences), ""
+    if many > _MANY * len(grid) or len(run) >= _LEAST_STILL:
+        concern = f"{many} frames have exactly the pose of another: tracking may have stood still"
+    if len(run) >= _LEAST_STILL:
+        first, last = (capture.images[run[end]].name for end in (0, -1))
+        concern += f" in {len(run)} successive frames, {first} to {last}; remove these if the camera moved there"
     if many >= len(grid) - 1:
         return Finding("duplicate poses", f"{many}", "all frames have the same pose", True, {"count": many})
     return Finding("duplicate poses", f"{many}", concern, figures={"count": many})
+
+
+def _longest_run(grid: NDArray[np.float64], sequences: Sequence[str]) -> NDArray[np.int64]:
+    """The rows of the longest run of successive frames of a sequence with the same pose."""
+    names = np.array(sequences)
+    changes = (grid[1:] != grid[:-1]).any(axis=1) | (names[1:] != names[:-1])
+    return max(np.split(np.arange(len(grid)), 1 + np.flatnonzero(changes)), key=len)
 
 
 def check_extent(capture: Capture, motion: Motion, unit: str) -> Finding:

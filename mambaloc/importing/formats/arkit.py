@@ -66,8 +66,8 @@ def read_record3d(source: Path) -> Capture:
     if len(rows) > 1 and not np.ptp(rows, axis=0).any():
         raise InputError(f"{path}: all {len(rows)} poses are the same; record with the LiDAR camera, which is tracked")
     quaternion = np.roll(rows[:, :4], 1, axis=1)
-    world_from_gl, _ = from_quaternions(rows[:, 4:], quaternion, lambda row: f"{path}: poses, row {row}")
-    world_from_cam = world_from_gl @ OPENCV_FROM_OPENGL
+    checked = from_quaternions(rows[:, 4:], quaternion, lambda row: f"{path}: poses, row {row}")
+    world_from_cam = checked.poses @ OPENCV_FROM_OPENGL
     folder = first_with_pictures([source / "rgbd", source / "rgb"])
     images = pictures(folder)
     numbered = {number_of(image): image for image in images}
@@ -79,9 +79,14 @@ def read_record3d(source: Path) -> Capture:
     return build_capture(
         "record3d",
         source,
-        [Posed(numbered[row], sequence, world_from_cam[row], names[row], times[row]) for row in present],
+        [
+            Posed(
+                numbered[row], sequence, world_from_cam[row], names[row], times[row], fault=checked.faults.get(row, "")
+            )
+            for row in present
+        ],
         unit="metre",
-        choices=_CHOICES,
+        choices={**_CHOICES, **checked.choices},
         cameras=cameras,
         missing=[f"{folder.name}/{row}{images[0].suffix}" for row in range(len(rows)) if row not in numbered],
         beside=images,
@@ -106,19 +111,31 @@ def read_polycam(source: Path) -> Capture:
     images = {image.stem: image for image in pictures(folders[1])}
     sequence, present = folder_name(source), [file for file in files if file.stem in images]
     read = [_polycam_frame(file, images[file.stem]) for file in present]
+    matrices = np.array([matrix for matrix, _ in read]).reshape(-1, 3, 4)
+    checked = validate_se3(matrices, lambda row: str(present[row]))
     names, cameras = told_apart([camera for _, camera in read])
     stamps = all(number_of(file) >= 0 for file in present)
     posed = [
-        Posed(images[file.stem], sequence, pose, name, number_of(file) / 1e6 if stamps else None)
-        for file, (pose, _), name in zip(present, read, names, strict=True)
+        Posed(
+            images[file.stem],
+            sequence,
+            checked.poses[row] @ OPENCV_FROM_OPENGL,
+            names[row],
+            number_of(file) / 1e6 if stamps else None,
+            fault=checked.faults.get(row, ""),
+        )
+        for row, file in enumerate(present)
     ]
-    corrected = folders[0].name.startswith("corrected")
     return build_capture(
         "polycam",
         source,
         posed,
         unit="metre",
-        choices={**_CHOICES, "poses": "optimised by the app" if corrected else "ARKit's own: the app optimised none"},
+        choices={
+            **_CHOICES,
+            "poses": _polycam_poses(folders[0], len(files)),
+            **checked.choices,
+        },
         cameras=cameras,
         missing=[f"{folders[1].name}/{file.stem}.jpg" for file in files if file.stem not in images],
         beside=images.values(),
@@ -156,15 +173,25 @@ def _polycam_folders(source: Path) -> tuple[Path, Path] | None:
     return None
 
 
+def _polycam_poses(cameras: Path, count: int) -> str:
+    """Which of an export's poses were taken, and which were not."""
+    raw, corrected = (cameras.with_name(f"{prefix}cameras") for prefix in ("", "corrected_"))
+    if cameras == corrected:
+        others = sum(not (corrected / file.name).is_file() for file in raw.glob("*.json"))
+        return f"{count} optimised by the app" + (f"; not read: {others} that it did not optimise" if others else "")
+    if corrected.is_dir():
+        return "ARKit's own: corrected_cameras are of corrected_images, which are missing"
+    return "ARKit's own: the app optimised none"
+
+
 def _polycam_frame(path: Path, image: Path) -> tuple[np.ndarray, Camera]:
-    """Pose and camera of a file and its image."""
+    """The matrix of a file, in ARKit's axes, and the camera of it and its image."""
     frame = read_object(path, "a camera of Polycam")
     keys = [f"t_{row}{column}" for row in range(3) for column in range(4)]
-    matrix = array_of([frame.get(key) for key in keys], (12,), "t_00 to t_23", path).reshape(1, 3, 4)
+    matrix = array_of([frame.get(key) for key in keys], (12,), "t_00 to t_23", path)
     fx, fy, cx, cy = array_of([frame.get(key) for key in ("fx", "fy", "cx", "cy")], (4,), "fx, fy, cx, cy", path)
     size = _polycam_size(frame, (cx, cy), path, image)
-    pose = validate_se3(matrix, lambda _: str(path))[0] @ OPENCV_FROM_OPENGL
-    return pose, pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path)
+    return matrix, pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path)
 
 
 def _polycam_size(frame: dict[str, object], centre: Sequence[float], path: Path, image: Path) -> list[float]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +18,18 @@ from mambaloc.runtime.rotations import is_rotation, matrix_from_quaternion, quat
 
 Matrices = NDArray[np.float64]
 
+SHORTEST, LONGEST = 0.5 - 1e-3, 2.0 + 1e-3
+"""Lengths of quaternions that are made units, and their rounding."""
+_ROUNDED = 1e-6  # of a rotation's entries
+_NONE_LISTED = "a split of its own that names none of the frames that have a pose and a picture"
+
 
 @dataclass(frozen=True)
 class Posed:
-    """One image and what a format says of it; the fields are those of :class:`Capture`."""
+    """One image and what a format says of it; the fields are those of :class:`Capture`.
+
+    An image whose pose has a ``fault`` is left out for that.
+    """
 
     image: Path
     sequence: str
@@ -31,6 +38,22 @@ class Posed:
     time_s: float | None = None
     split: str | None = None
     depth: Path | None = None
+    fault: str = ""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Poses that a file has, checked.
+
+    Args:
+        poses: (N, 4, 4); NaN where a pose is a mark of no fix or is left out.
+        faults: why poses are left out, by row.
+        choices: how many rotations were made exact, and the largest repair, where it was more than rounding.
+    """
+
+    poses: Matrices
+    faults: Mapping[int, str]
+    choices: Mapping[str, str]
 
 
 def build_capture(
@@ -45,6 +68,7 @@ def build_capture(
     beside: Iterable[Path] = (),
     left_out: Mapping[Path, str] | None = None,
     depth_camera: Matrices | None = None,
+    split_concern: str = "",
 ) -> Capture:
     """Make a capture: sequence after sequence, in the order of their first images.
 
@@ -59,14 +83,16 @@ def build_capture(
         beside: images that are there, of which some may be among ``posed``.
         left_out: why images are left out that the format marks as bad.
         depth_camera: (3, 3), in pixels of depth frames, which are in millimetres.
+        split_concern: as of :class:`Capture`.
 
     Raises:
         InputError: for no image, one with two poses, or more than a scene may have.
     """
-    marked = left_out or {}
-    if not posed and marked:
+    marked = {**(left_out or {}), **{each.image: each.fault for each in posed if each.fault}}
+    if marked and all(each.fault for each in posed):
+        image, rule = next(iter(marked.items()))
         raise InputError(
-            f"{source}: all {len(marked)} images with a pose are {next(iter(marked.values()))}; mark fewer"
+            f"{source}: all {len(marked)} images with a pose are left out, such as {image.name}: {rule}; correct them"
         )
     if not posed:
         named = f"; {len(missing)} are named and missing, such as {missing[0]!r}" if missing else ""
@@ -78,6 +104,7 @@ def build_capture(
         if each.image in used:
             raise InputError(f"{source}: gives {each.image} more than one pose; remove all but one")
         used.add(each.image)
+    posed = [each for each in posed if not each.fault]
     known = {*used, *marked}
     rank = {name: at for at, name in enumerate(dict.fromkeys(each.sequence for each in posed))}
     ordered = sorted(posed, key=lambda each: rank[each.sequence])
@@ -99,10 +126,11 @@ def build_capture(
         images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in known),
         left_out={str(image): rule for image, rule in marked.items()},
         depth=None if depth_camera is None else Depth(tuple(each.depth for each in ordered), depth_camera),
+        split_concern=split_concern or (_NONE_LISTED if splits and set(splits) == {"unused"} else ""),
     )
 
 
-def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
+def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Checked:
     """Check transforms, and make rotations that were rounded in a text exact.
 
     Args:
@@ -110,45 +138,76 @@ def validate_se3(matrices: Matrices, where: Callable[[int], str]) -> Matrices:
         where: names a row, for messages.
 
     Returns:
-        (N, 4, 4); NaN where a pose is a mark of no fix: NaN, infinite, one number throughout, or a rotation of zeros.
+        The poses; a mark of no fix is NaN, infinite, one number throughout, or a rotation of zeros.
 
     Raises:
-        InputError: for any other row that is no rigid transform.
+        InputError: where none is a rigid transform, and not all are marks.
     """
     lost = is_mark(matrices[:, :3].reshape(-1, 12), matrices[:, :3, :3].reshape(-1, 9))
     matrices = np.where(lost[:, None, None], np.eye(4)[: matrices.shape[1]], matrices)
     rotation, position = matrices[:, :3, :3], matrices[:, :3, 3]
-    _refuse(~is_rotation(rotation, ROTATION_TOLERANCE), where, "the pose's rotation is not orthonormal")
+    rules = {"the pose's rotation is not orthonormal": np.asarray(~is_rotation(rotation, ROTATION_TOLERANCE))}
     if matrices.shape[1] == 4:
         is_last = np.isclose(matrices[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6).all(axis=1)
-        _refuse(~is_last, where, "the pose's last row is not 0 0 0 1")
-    world_from_cam = rigid_transforms(matrix_from_quaternion(quaternion_from_matrix(rotation)), position)
-    return np.where(lost[:, None, None], np.nan, world_from_cam)
+        rules["the pose's last row is not 0 0 0 1"] = np.asarray(~is_last)
+    faults, usable = _faults(rules, lost, where)
+    exact = matrix_from_quaternion(quaternion_from_matrix(np.where(usable[:, None, None], rotation, np.eye(3))))
+    off = np.where(usable, np.abs(exact - rotation).max(axis=(1, 2)), 0.0)
+    poses = np.where(usable[:, None, None], rigid_transforms(exact, position), np.nan)
+    return Checked(poses, faults, _repaired("rotations", "orthonormal", off, _ROUNDED, where))
 
 
-def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[int], str]) -> tuple[Matrices, int]:
-    """Transforms of positions and quaternions.
+def from_quaternions(position: Matrices, quaternion: Matrices, where: Callable[[int], str]) -> Checked:
+    """Check transforms of positions and quaternions.
 
     Args:
         position: (N, 3).
-        quaternion: (N, 4), wxyz; those that are about unit are made so.
+        quaternion: (N, 4), wxyz; those that are half to twice as long as a unit are made so.
         where: names a row, for messages.
 
     Returns:
-        (N, 4, 4), and how many quaternions were off by more than rounding. NaN where a pose is a mark of no fix: NaN,
-        infinite, one number throughout, or a quaternion of zeros.
+        The poses; a mark of no fix is NaN, infinite, one number throughout, or a quaternion of zeros.
 
     Raises:
-        InputError: for any other quaternion that is far from unit.
+        InputError: where none has a quaternion of about unit length, and not all are marks.
     """
     lost = is_mark(np.concatenate((position, quaternion), axis=1), quaternion)
-    position = np.where(lost[:, None], 0.0, position)
     quaternion = np.where(lost[:, None], (1.0, 0.0, 0.0, 0.0), quaternion)
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
-    _refuse(~((norm > 0.5) & (norm < 2)), where, "the quaternion is far from unit length")
-    world_from_cam = rigid_transforms(matrix_from_quaternion(quaternion), position)
-    return np.where(lost[:, None, None], np.nan, world_from_cam), int((np.abs(norm - 1) > UNIT_TOLERANCE).sum())
+    is_bad = ~((norm >= SHORTEST) & (norm <= LONGEST))
+    faults, usable = _faults({"the quaternion is far from unit length": is_bad}, lost, where)
+    rotation = matrix_from_quaternion(np.where(usable[:, None], quaternion, (1.0, 0.0, 0.0, 0.0)))
+    poses = np.where(usable[:, None, None], rigid_transforms(rotation, position), np.nan)
+    off = np.where(usable, np.abs(norm - 1), 0.0)
+    return Checked(poses, faults, _repaired("quaternions", "of unit length", off, UNIT_TOLERANCE, where))
+
+
+def _faults(
+    rules: Mapping[str, NDArray[np.bool_]], lost: NDArray[np.bool_], where: Callable[[int], str]
+) -> tuple[dict[int, str], NDArray[np.bool_]]:
+    """The first rule that rows break, with where they are; and which rows have a pose.
+
+    Raises:
+        InputError: where all rows that are no marks break one.
+    """
+    usable: NDArray[np.bool_] = ~lost
+    faults: dict[int, str] = {}
+    for rule, is_bad in rules.items():
+        faults |= {row: f"{rule} ({where(row)})" for row in np.flatnonzero(usable & is_bad).tolist()}
+        usable = np.asarray(usable & ~is_bad)
+    if faults and not usable.any():
+        row = min(faults)
+        raise InputError(f"{where(row)}: {faults[row].partition(' (')[0]}; correct or remove it")
+    return faults, usable
+
+
+def _repaired(name: str, what: str, off: Matrices, least: float, where: Callable[[int], str]) -> dict[str, str]:
+    """How many rotations were made exact, and the largest repair; nothing where none is more than rounding."""
+    count, worst = int((off > least).sum()), int(off.argmax()) if len(off) else 0
+    if not count:
+        return {}
+    return {name: f"{count} of {len(off)} were not {what}, and made so; at most {off[worst]:.2g} off ({where(worst)})"}
 
 
 def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[float], where: str | Path) -> Camera:
@@ -182,8 +241,3 @@ def is_mark(poses: Matrices, rotations: Matrices) -> NDArray[np.bool_]:
     """Which rows (N, K) loggers and trackers write where they have no pose; of these the numbers of rotations."""
     is_constant = (poses == poses[:, :1]).all(axis=1)
     return ~np.isfinite(poses).all(axis=1) | is_constant | (rotations == 0).all(axis=1)
-
-
-def _refuse(is_bad: Any, where: Callable[[int], str], rule: str) -> None:
-    if np.any(is_bad):
-        raise InputError(f"{where(int(np.argmax(is_bad)))}: {rule}; correct or remove it")

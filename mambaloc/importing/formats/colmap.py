@@ -21,11 +21,10 @@ from mambaloc.data.colmap import colmap_models, is_sound, load_colmap
 from mambaloc.data.colmap_text import count_images
 from mambaloc.data.tracks import Tracks
 from mambaloc.errors import InputError
-from mambaloc.files import path_inside
 from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import Posed, build_capture, validate_se3
-from mambaloc.importing.formats.finding import SMALLER, Found, find_pictures
+from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
+from mambaloc.importing.formats.finding import SMALLER, Found, count_there, find_pictures
 from mambaloc.importing.formats.parsing import folder_name, pictures_beside
 from mambaloc.text import natural
 
@@ -58,13 +57,20 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
     if not placed:
         raise InputError(f"{path}: places none of its {len(model.images)} images; reconstruct again")
     found = _find(source, path, images, [image.name for image in placed])
-    cam_from_world = np.array([image.cam_from_world().matrix() for image in placed])
-    world_from_cam = np.linalg.inv(validate_se3(cam_from_world, lambda row: f"{path}, image {placed[row].name[:80]!r}"))
+    # A text's quaternions are as they were written: pycolmap makes them no unit.
+    cam_from_world = [image.cam_from_world() for image in placed]
+    checked = from_quaternions(
+        np.array([each.translation for each in cam_from_world]),
+        np.roll([each.rotation.quat for each in cam_from_world], 1, axis=1),
+        lambda row: f"{path}, image {placed[row].name[:80]!r}",
+    )
+    world_from_cam = np.linalg.inv(checked.poses)
     cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(placed)}
     posed, missing = [], []
-    for image, file, pose in zip(placed, found.files, world_from_cam, strict=True):
+    for row, (image, file, pose) in enumerate(zip(placed, found.files, world_from_cam, strict=True)):
         if file not in found.missing:
-            posed.append(Posed(file, _sequence(image.name, source), pose, f"camera-{image.camera_id}"))
+            camera, fault = f"camera-{image.camera_id}", checked.faults.get(row, "")
+            posed.append(Posed(file, _sequence(image.name, source), pose, camera, fault=fault))
         else:
             missing.append(image.name)
     choices = {
@@ -74,6 +80,7 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
         "origin": "kept",
         "model": _said(source, models),
         **found.choices,
+        **checked.choices,
     }
     beside = pictures_beside(each.image for each in posed)
     capture = build_capture(
@@ -126,8 +133,7 @@ def _find(source: Path, model: Path, images: Path | None, names: list[str]) -> F
         folders += [root.parent / "images", root.parent.parent / "images"]
     folder, most = images or source, 0
     for candidate in folders if images is None else ():
-        paths = [path_inside(candidate, name) for name in names]
-        count = sum(path is not None and path.is_file() for path in paths)
+        count = count_there(candidate, names)
         folder, most = (candidate, count) if count > most else (folder, most)
         if most == len(names):
             break

@@ -21,11 +21,10 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.files import path_inside
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
-from mambaloc.importing.formats.finding import Found, find_pictures
+from mambaloc.importing.formats.finding import Found, count_there, find_pictures
 from mambaloc.importing.formats.parsing import (
     as_numbers,
     first_with_pictures,
@@ -98,10 +97,17 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
     def where(row: int) -> str:
         return f"{path}, line {rows[row][0]}"
 
-    world_from_cam, mended = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), where)
+    checked = from_quaternions(table[:, :3], _turned(table[:, 3:], direction), where)
     pictured = (_by_time if columns.image is None else _by_image)(path, rows, columns, images)
     posed = [
-        Posed(image, sequence, world_from_cam[row], time_s=time_s, split=_split(path, *rows[row]))
+        Posed(
+            image,
+            sequence,
+            checked.poses[row],
+            time_s=time_s,
+            split=_split(path, *rows[row]),
+            fault=checked.faults.get(row, ""),
+        )
         for image, sequence, row, time_s in pictured.frames
     ]
     is_known = columns.position == _POSITIONS[2] or (columns.position == _POSITIONS[0] and "scene" in rows[0][1])
@@ -111,9 +117,8 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
         "scale": "metres, as the datasets have them" if is_known else "unknown: the table does not tell",
         "origin": "kept",
         "association": pictured.how,
+        **checked.choices,
     }
-    if mended:
-        choices["quaternions"] = f"{mended} of {len(rows)} were not of unit length, and made so"
     beside = pictures_beside(each.image for each in posed)
     missing = pictured.missing
     kind = "csv" if direction is None else f"csv_{direction}"
@@ -216,7 +221,7 @@ def _numbers(path: Path, line: int, row: dict[str, str], columns: _Columns) -> n
     values = as_numbers(["nan" if word.lower() in _NO_FIX else word for word in words])
     if values is None:
         names = ",".join((*columns.position, *columns.quaternion))
-        raise InputError(f"{path}, line {line}: {names} must be numbers; correct or remove the row")
+        raise InputError(f"{path}, line {line}: {names} must be numbers with points; correct or remove the row")
     return values
 
 
@@ -259,14 +264,8 @@ def _images(path: Path, rows: list[Row], columns: _Columns, given: Path | None) 
     within = [(name.removeprefix(f"{scene}/"), where) for name, scene, where in names]
     root = given or path.parent
     candidates = [(root, whole), (root / "images", whole), (root, within)]
-    folder, named = max(candidates, key=lambda candidate: _count(*candidate))
+    folder, named = max(candidates, key=lambda each: count_there(each[0], [name for name, _ in each[1]]))
     return folder, find_pictures(folder, named)
-
-
-def _count(folder: Path, named: list[tuple[str, str]]) -> int:
-    """How many names are of files in a folder."""
-    paths = (path_inside(folder, name) for name, _ in named)
-    return sum(path is not None and path.is_file() for path in paths)
 
 
 def _split(path: Path, line: int, row: dict[str, str]) -> str | None:

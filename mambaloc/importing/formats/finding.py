@@ -7,6 +7,7 @@ looked at, and the search follows no symbolic link.
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -16,15 +17,15 @@ from typing import Any
 
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside
-from mambaloc.images import PICTURES
+from mambaloc.images import PICTURES, pictures
 
 SMALLER = ("_2", "_4", "_8")
 """What the folders of smaller copies add to a folder's name, the largest first: those of splatting data sets."""
 
+_OTHER = re.compile(r"depth|mask|semantic|label|normal|confidence", re.IGNORECASE)  # folders of no pictures
 _MOST_FILES = 1_000_000
 _LONGEST_NAME = 255  # bytes
 _GIVE = "Give the folder of the pictures with --images."
-_GIVE_ELSE = "If they are elsewhere, give their folder with --images."
 
 Parts = tuple[str, ...]
 
@@ -54,7 +55,8 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
 
     A picture that is not where its path says is looked for in the folders of smaller copies, as ``images_4`` of
     ``images``, and then by the longest end of its path that a file below the root has. An end of the file's name alone
-    counts only where all paths are of one folder: otherwise the folder may be what tells pictures apart.
+    counts only where all paths are of one folder: otherwise the folder may be what tells pictures apart. A picture with
+    another suffix counts where its folder is called as the path says, or is the root: elsewhere it may be depth.
 
     Args:
         root: the folder that paths are relative to.
@@ -78,13 +80,24 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
             f"end. {_GIVE}"
         )
     if not any(files):
+        others = next(iter(_Tails(root).known.values()), None)
+        there = f", while {'/'.join(others[0])!r} is there" if others else ""
         raise InputError(
-            f"{root}: has no image with a pose; {len(named)} are named and missing, such as {named[0][0][-60:]!r}. Put "
-            f"them there. {_GIVE_ELSE}"
+            f"{root}: has no image with a pose; {len(named)} are named and missing, such as {named[0][0][-60:]!r}"
+            f"{there}. {_GIVE}"
         )
     absent = {row: direct[row] or root / path_parts(named[row][0])[-1] for row in lost if files[row] is None}
     every = tuple(file or absent[row] for row, file in enumerate(files))
     return Found(every, frozenset(absent.values()), _said(root, named, every, [row for row in lost if files[row]]))
+
+
+def count_there(folder: Path, names: Sequence[str]) -> int:
+    """How many names are of pictures in a folder: all as they are written, or else all without their suffixes."""
+    paths = [path for name in names if (path := path_inside(folder, name)) is not None]
+    if count := sum(path.is_file() for path in paths):
+        return count
+    stems = {parent: {picture.stem for picture in pictures(parent)} for parent in {path.parent for path in paths}}
+    return sum(path.stem in stems[path.parent] for path in paths)
 
 
 def _by_tails(
@@ -114,10 +127,15 @@ def _is_possible(root: Path, name: str) -> bool:
 
 def _said(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], moved: Sequence[int]) -> str:
     """How pictures were found that are not where their names say."""
-    if not moved:
-        return ""
-    name, place = named[moved[0]][0], files[moved[0]].relative_to(root).as_posix()
-    return f"{len(moved)} of {len(named)} by the ends of their paths: {name[-60:]!r} is {place}"
+    ways: dict[str, list[int]] = {"by the ends of their paths": [], "by their names without suffix": []}
+    for row in moved:
+        name = path_parts(named[row][0])[-1]
+        is_spelled = not _has_suffix(name) or PurePosixPath(name).suffix.lower() == files[row].suffix.lower()
+        ways["by the ends of their paths" if is_spelled else "by their names without suffix"].append(row)
+    said = {way: (named[rows[0]][0][-60:], files[rows[0]].relative_to(root)) for way, rows in ways.items() if rows}
+    return "; ".join(
+        f"{len(ways[way])} of {len(named)} {way}: {name!r} is {place.as_posix()}" for way, (name, place) in said.items()
+    )
 
 
 def path_parts(name: str) -> Parts:
@@ -155,7 +173,7 @@ def _has_suffix(name: str) -> bool:
 
 
 class _Tails:
-    """The pictures below a folder, by their names."""
+    """The pictures below a folder, by their names without suffix."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -168,7 +186,7 @@ class _Tails:
             for name in names:
                 file = Path(folder, name)
                 if file.suffix.lower() in PICTURES and (not file.is_symlink() or file.resolve().is_relative_to(inside)):
-                    self.known[_folded(name)].append(file.relative_to(root).parts)
+                    self.known[_folded(file.stem)].append(file.relative_to(root).parts)
 
     def find(self, parts: Parts, least: int, name: str, where: str) -> Path | None:
         """The picture with the longest common end, of so many parts at least.
@@ -176,17 +194,22 @@ class _Tails:
         Raises:
             InputError: where two have it.
         """
-        ends = {spelled: tuple(map(_folded, (*parts[:-1], spelled))) for spelled in _spelled(parts[-1])}
-        found = [
-            (_common(tuple(map(_folded, known)), end), known)
-            for end in ends.values()
-            for known in self.known.get(end[-1], ())
-        ]
-        longest = max((length for length, _ in found), default=0)
-        if longest < least:
+        *folders, file = parts
+        spelled = set(_spelled(file))
+        folded = set(map(_folded, spelled))
+        stem = PurePosixPath(file).stem if _has_suffix(file) else file
+        found: dict[tuple[int, bool], list[Parts]] = defaultdict(list)
+        for known in self.known.get(_folded(stem), ()):
+            length, is_named = 1 + _common(known[:-1], folders), _folded(known[-1]) in folded
+            if length == 1 and len(known) > 1 and (not is_named or _OTHER.search(known[-2])):
+                continue
+            if length >= least:
+                found[length, is_named].append(known)
+        if not found:
             return None
-        best = sorted({known for length, known in found if length == longest})
-        exact = [known for known in best if known[-1] in ends]
+        best = sorted(found[max(found)])
+        best = _largest(best) if max(found)[0] > 1 else best  # of a bare name a folder may be another camera's
+        exact = [known for known in best if known[-1] in spelled]
         best = exact if len(exact) == 1 else best
         if len(best) > 1:
             raise InputError(
@@ -196,14 +219,23 @@ class _Tails:
         return self.root.joinpath(*best[0])
 
 
-def _common(known: Parts, end: Parts) -> int:
-    """How many parts two paths have in common, from their ends."""
+def _common(known: Sequence[str], named: Sequence[str]) -> int:
+    """How many folders two paths have in common, from their ends; one of smaller copies counts as the named one."""
     length = 0
-    for a, b in zip(reversed(known), reversed(end), strict=False):
-        if a != b:
+    for a, b in zip(map(_folded, reversed(known)), map(_folded, reversed(named)), strict=False):
+        if a not in (b, *(b + end for end in SMALLER)):
             break
         length += 1
     return length
+
+
+def _largest(paths: list[Parts]) -> list[Parts]:
+    """Of copies in different sizes the largest; all paths where some are no copies of the others."""
+    ends = [next((end for end in SMALLER if path[-2].endswith(end)), "") for path in paths]
+    if len({(*path[:-2], path[-2].removesuffix(end)) for path, end in zip(paths, ends, strict=True)}) > 1:
+        return paths
+    first = min(ends, key=("", *SMALLER).index)
+    return [path for path, end in zip(paths, ends, strict=True) if end == first]
 
 
 def _folded(name: str) -> str:

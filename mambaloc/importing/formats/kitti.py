@@ -51,17 +51,18 @@ def read_kitti(source: Path) -> Capture:
     """
     sequence = _only_sequence(source)
     table = read_table(_poses_file(sequence), 12, _ROW, may_lack_fix=True)
-    world_from_cam = validate_se3(table.numbers.reshape(-1, 3, 4), table.where)
+    checked = validate_se3(table.numbers.reshape(-1, 3, 4), table.where)
     folder = first_with_pictures([sequence / "image_2", sequence / "image_0"])
     images = pictures(folder)
     camera, cam0_from_cam = _camera(sequence / "calib.txt", folder.name, images[0])
-    times = _times(sequence / "times.txt", len(world_from_cam))
+    times = _times(sequence / "times.txt", len(checked.poses))
     numbered = {number_of(image): image for image in images}
     posed, missing = [], []
-    for row, world_from_cam0 in enumerate(world_from_cam):
+    for row, world_from_cam0 in enumerate(checked.poses):
         if row in numbered:
             pose = world_from_cam0 @ cam0_from_cam
-            posed.append(Posed(numbered[row], sequence.name, pose, folder.name, None if times is None else times[row]))
+            time_s, fault = None if times is None else times[row], checked.faults.get(row, "")
+            posed.append(Posed(numbered[row], sequence.name, pose, folder.name, time_s, fault=fault))
         else:
             missing.append(f"{folder.name}/{row:06d}{images[0].suffix}")
     moved = f"poses of camera 0, moved {np.linalg.norm(cam0_from_cam[:3, 3]) * 100:.1f} cm to {folder.name}'s"
@@ -70,7 +71,7 @@ def read_kitti(source: Path) -> Capture:
         source,
         posed,
         unit="metre",
-        choices={**_CHOICES, "scale": "metres, as the benchmark has them", "camera": moved},
+        choices={**_CHOICES, "scale": "metres, as the benchmark has them", "camera": moved, **checked.choices},
         cameras={folder.name: camera},
         missing=missing,
         beside=images,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -13,7 +14,22 @@ from mambaloc.importing.formats.finding import path_parts
 _SHOWN = 3  # names in a line
 
 
-def given_split(names: Sequence[Any], lists: Mapping[str, Sequence[str]]) -> tuple[dict[int, str], dict[str, str]]:
+@dataclass(frozen=True)
+class Given:
+    """A split that lists of names give.
+
+    Args:
+        split: of each row that a list names.
+        choices: what was decided.
+        concern: what is wrong with the lists, in a line; empty where nothing is.
+    """
+
+    split: dict[int, str]
+    choices: dict[str, str]
+    concern: str = ""
+
+
+def given_split(names: Sequence[Any], lists: Mapping[str, Sequence[str]]) -> Given:
     """Find the frames that lists name: by their paths, or by the ends of these where one frame alone has such an end.
 
     Validation frames are the test split where a capture lists no others to test on. A frame of several lists is never
@@ -22,9 +38,6 @@ def given_split(names: Sequence[Any], lists: Mapping[str, Sequence[str]]) -> tup
     Args:
         names: of frames, as the source has them.
         lists: names by split: ``train``, ``val``, ``test``.
-
-    Returns:
-        The split of each row that a list names, and what was decided, for ``choices``.
     """
     rows_of: dict[tuple[str, ...], list[int]] = defaultdict(list)
     for row, name in enumerate(names):
@@ -42,10 +55,20 @@ def given_split(names: Sequence[Any], lists: Mapping[str, Sequence[str]]) -> tup
                 continue
             twice += found.get(of, split) != split
             found[of] = split
-    return _with_test(found, unknown, twice)
+    return replace(_with_test(found, unknown, twice), concern=_concern(found, unknown, names))
 
 
-def _with_test(found: dict[int, str], unknown: Sequence[str], twice: int) -> tuple[dict[int, str], dict[str, str]]:
+def _concern(found: Mapping[int, str], unknown: Sequence[str], names: Sequence[Any]) -> str:
+    """What is wrong with lists that name others than the frames, with a name of each side."""
+    if not unknown:
+        return ""
+    example = f"{unknown[0][-60:]!r} is listed, {str(names[0])[-60:]!r} is a frame"
+    if not found:
+        return f"lists of names that are of none of its frames ({example})"
+    return f"lists with {len(unknown)} names of no frame, or of several ({example})"
+
+
+def _with_test(found: dict[int, str], unknown: Sequence[str], twice: int) -> Given:
     said = []
     if "val" in found.values() and "test" not in found.values():
         found = {row: "test" if split == "val" else split for row, split in found.items()}
@@ -55,7 +78,7 @@ def _with_test(found: dict[int, str], unknown: Sequence[str], twice: int) -> tup
     if unknown:
         more = ", ..." if len(unknown) > _SHOWN else ""
         said.append(f"{len(unknown)} listed names are of no frame, or of several: {', '.join(unknown[:_SHOWN])}{more}")
-    return found, {"split": "; ".join(said)} if said else {}
+    return Given(found, {"split": "; ".join(said)} if said else {})
 
 
 def _row(parts: tuple[str, ...], rows_of: Mapping[tuple[str, ...], list[int]], names: Sequence[Any]) -> int | None:

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from mambaloc.data.frames import ROTATION_TOLERANCE
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
-from mambaloc.importing.formats.builder import Matrices, Posed, build_capture
+from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, validate_se3
 from mambaloc.importing.formats.finding import find_pictures
 from mambaloc.importing.formats.listed_splits import given_split
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
@@ -40,7 +41,7 @@ _BAD = "marked is_bad by the capture"
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame of a file; ``split`` where the file tells it by where the frame is listed."""
+    """A frame of a file; ``split`` where the file tells it by where the frame is listed; ``fault`` of its matrix."""
 
     where: str
     name: Any
@@ -48,6 +49,7 @@ class _Frame:
     intrinsics: dict[str, Any]
     split: str | None
     is_bad: bool
+    fault: str
 
 
 def matches(source: Path) -> bool:
@@ -73,11 +75,16 @@ def read(source: Path, images: Path | None = None) -> Capture:
         raise InputError(f"{source}: holds none of {', '.join(FILES)}; give a folder that does")
     contents = {file: _content(file) for file in (files[:1] if files[0].name == "transforms.json" else files)}
     frames = [frame for file, content in contents.items() for frame in _frames(file, content)]
-    given, said = given_split([frame.name for frame in frames], _lists(contents))
+    if all(frame.fault for frame in frames):
+        raise InputError(f"{frames[0].fault}; correct it")
+    frames, exact = _with_exact_rotations(frames)
+    given = given_split([frame.name for frame in frames], _lists(contents))
     folder = files[0].parent if images is None else images
     found = find_pictures(folder, [(frame.name, f"{frame.where}: file_path") for frame in frames])
-    if given:
-        frames = [replace(frame, split=given.get(row) or frame.split or "unused") for row, frame in enumerate(frames)]
+    if given.split:
+        frames = [
+            replace(frame, split=given.split.get(row) or frame.split or "unused") for row, frame in enumerate(frames)
+        ]
     pairs = sorted(zip(found.files, frames, strict=True), key=lambda pair: (natural(pair[0].parent), natural(pair[0])))
     there = [(image, frame) for image, frame in pairs if image not in found.missing]
     good = [(image, frame) for image, frame in there if not frame.is_bad]
@@ -85,7 +92,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         [frame.intrinsics for _, frame in good], [image for image, _ in good], files[0]
     )
     posed = [
-        Posed(image, _sequence(image, folder), frame.world_from_cam, name, split=frame.split)
+        Posed(image, _sequence(image, folder), frame.world_from_cam, name, split=frame.split, fault=frame.fault)
         for (image, frame), name in zip(good, names, strict=True)
     ]
     choices = _choices(files[0].name, contents[files[0]], [file.name for file in files if file not in contents])
@@ -94,10 +101,11 @@ def read(source: Path, images: Path | None = None) -> Capture:
         files[0],
         posed,
         unit="unknown",
-        choices={**choices, "cameras": decided, **said, **found.choices},
+        choices={**choices, "cameras": decided, **given.choices, **found.choices, **exact},
         cameras=cameras,
         missing=[image.relative_to(folder).as_posix() for image, _ in pairs if image in found.missing],
         beside=pictures_beside(image for image, _ in pairs),
+        split_concern=given.concern,
         left_out={image: _BAD for image, frame in there if frame.is_bad},
     )
 
@@ -122,8 +130,12 @@ def _frames(file: Path, content: dict[str, Any]) -> Iterator[_Frame]:
         is_test = count > len(content["frames"])
         where = f"{file}, test frame {count - len(content['frames'])}" if is_test else f"{file}, frame {count}"
         rows = frame.get("transform_matrix")
-        lost = np.full((4, 4), np.nan)  # a tracker's frame without a pose
-        world_from_cam = lost if rows is None else _matrix(rows, f"{where}: transform_matrix") @ OPENCV_FROM_OPENGL
+        world_from_cam, fault = np.full((4, 4), np.nan), ""  # a tracker's frame without a pose
+        try:
+            if rows is not None:
+                world_from_cam = _matrix(rows, f"{where}: transform_matrix") @ OPENCV_FROM_OPENGL
+        except ValueError as error:
+            fault = str(error)
         world_from_cam[:3, 3] /= scale
         yield _Frame(
             where,
@@ -132,7 +144,19 @@ def _frames(file: Path, content: dict[str, Any]) -> Iterator[_Frame]:
             {**shared, **{key: frame[key] for key in KEYS if key in frame}},
             FILES.get(file.name) or ("test" if is_test else "train" if test else None),
             frame.get("is_bad") in (True, "true", "True"),
+            fault,
         )
+
+
+def _with_exact_rotations(frames: list[_Frame]) -> tuple[list[_Frame], Mapping[str, str]]:
+    """Frames whose rotations are exact where they were rounded, and what was decided; the checks leave out others."""
+    poses = np.array([frame.world_from_cam for frame in frames])
+    rows = np.flatnonzero(is_rotation(poses[:, :3, :3], ROTATION_TOLERANCE))
+    if not len(rows):
+        return frames, {}
+    checked = validate_se3(poses[rows], lambda row: frames[rows[row]].where)
+    poses[rows] = checked.poses
+    return [replace(frame, world_from_cam=pose) for frame, pose in zip(frames, poses, strict=True)], checked.choices
 
 
 def _lists(contents: Mapping[Path, dict[str, Any]]) -> dict[str, list[str]]:
@@ -159,7 +183,10 @@ def _original_from_file(file: Path, content: dict[str, Any]) -> tuple[Matrices, 
         raise InputError(f"{file}: applied_scale is {scale}; correct it, or remove it")
     if content.get("applied_transform") is None:
         return np.eye(4), scale or 1.0
-    applied = _matrix(content["applied_transform"], f"{file}: applied_transform")
+    try:
+        applied = _matrix(content["applied_transform"], f"{file}: applied_transform")
+    except ValueError as error:
+        raise InputError(f"{error}; correct it, or remove it") from None
     if not is_rotation(applied[:3, :3]) or not np.isfinite(applied).all():
         raise InputError(f"{file}: applied_transform is no rotation and shift; correct it, or remove it")
     return np.linalg.inv(applied).astype(np.float64), scale or 1.0
@@ -187,13 +214,17 @@ def _choices(file: str, content: dict[str, Any], other_files: Sequence[str]) -> 
 
 
 def _matrix(rows: Any, where: str) -> Matrices:
-    """A 4x4 or 3x4 matrix as (4, 4); NaN and infinity are kept."""
+    """A 4x4 or 3x4 matrix as (4, 4); NaN and infinity are kept.
+
+    Raises:
+        ValueError: for anything else.
+    """
     try:
         matrix = np.array([[float(each) for each in row] for row in rows])
     except (ValueError, TypeError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)):
-        raise InputError(f"{where} is no 4x4 or 3x4 matrix of numbers; correct it")
+        raise ValueError(f"{where} is no 4x4 or 3x4 matrix of numbers")
     if np.isfinite(matrix[3:]).all() and not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
-        raise InputError(f"{where}'s last row is not 0 0 0 1; correct it")
+        raise ValueError(f"{where}'s last row is not 0 0 0 1")
     return np.concatenate((matrix[:3], [[0.0, 0.0, 0.0, 1.0]]))

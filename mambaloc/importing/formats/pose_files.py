@@ -19,7 +19,7 @@ from mambaloc.data.points.depth import INTRINSICS_FILE, depth_path, read_depth_i
 from mambaloc.errors import InputError
 from mambaloc.images import pictures, stored_size
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
+from mambaloc.importing.formats.builder import Checked, Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import as_numbers, folder_name, number_of, read_text
 from mambaloc.importing.formats.pose_lines import Direction, towards_world
 from mambaloc.importing.formats.pose_rows import is_by_column, matrices_of
@@ -79,16 +79,23 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
     if not groups:
         raise InputError(f"{source}: has no picture with a pose file beside it, as X.jpg with X.txt. {_TABLE}")
     files = [file for group in groups for _, file in group.pairs]
-    matrices, by_column = _read_matrices(files)
-    poses = towards_world(matrices, direction)
+    checked, by_column = _read_matrices(files)
+    poses = towards_world(checked.poses, direction)
     is_layout = all(file.name.endswith(".pose.txt") for file in files)
     camera = _official_camera(groups[0].pairs[0][0]) if is_layout else None
-    placed = iter(poses)
     images = [(group.name, image) for group in groups for image, _ in group.pairs]
     depth, depth_camera = _depth(source, [image for _, image in images]) if is_layout else ([None] * len(images), None)
     posed = [
-        Posed(image, name, next(placed), None if camera is None else "colour", split=_split(name), depth=each)
-        for (name, image), each in zip(images, depth, strict=True)
+        Posed(
+            image,
+            name,
+            pose,
+            None if camera is None else "colour",
+            split=_split(name),
+            depth=each,
+            fault=checked.faults.get(row, ""),
+        )
+        for row, ((name, image), pose, each) in enumerate(zip(images, poses, depth, strict=True))
     ]
     told = {"written": "column after column"} if by_column else {}
     unit = "metres, as 7-Scenes has them" if is_layout else "unknown: pose files do not tell"
@@ -104,6 +111,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
             "origin": "kept",
             "association": "each picture with the file of its name",
             **told,
+            **checked.choices,
         },
         cameras={} if camera is None else {"colour": camera},
         missing=[file.name for group in groups for file in group.poses_alone],
@@ -199,8 +207,8 @@ def _numbers(file: Path) -> Matrices:
     return values
 
 
-def _read_matrices(files: list[Path]) -> tuple[Matrices, bool]:
-    """Transforms of files, (N, 4, 4), NaN of empty ones, and whether they are written column after column."""
+def _read_matrices(files: list[Path]) -> tuple[Checked, bool]:
+    """Transforms of files, NaN of empty ones, and whether they are written column after column."""
     values = [_numbers(file) for file in files]
     usual = next((len(numbers) for numbers in values if len(numbers)), 0)
     values = [numbers if len(numbers) else np.full(usual, np.nan) for numbers in values]

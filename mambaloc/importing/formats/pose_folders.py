@@ -61,18 +61,25 @@ def read_scannet(source: Path) -> Capture:
     tracked = [file for file, matrix in matrices.items() if np.isfinite(matrix).all()]
     if not tracked:
         raise InputError(f"{folder / 'pose'}: all {len(files)} poses are infinite or NaN; record again")
-    world_from_cam = validate_se3(np.stack([matrices[file] for file in tracked]), lambda row: str(tracked[row]))
+    checked = validate_se3(np.stack([matrices[file] for file in tracked]), lambda row: str(tracked[row]))
     camera = _scannet_camera(folder / "intrinsic" / "intrinsic_color.txt", next(iter(images.values())))
     name = folder_name(source)
-    present = [
-        (images[file.stem], pose) for file, pose in zip(tracked, world_from_cam, strict=True) if file.stem in images
+    camera_name = None if camera is None else "color"
+    posed = [
+        Posed(images[file.stem], name, pose, camera_name, fault=checked.faults.get(row, ""))
+        for row, (file, pose) in enumerate(zip(tracked, checked.poses, strict=True))
+        if file.stem in images
     ]
     return build_capture(
         "scannet",
         source,
-        [Posed(image, name, pose, None if camera is None else "color") for image, pose in present],
+        posed,
         unit="metre",
-        choices={**_CHOICES, "lost": f"{len(files) - len(tracked)} of {len(files)} poses are infinite: left out"},
+        choices={
+            **_CHOICES,
+            "lost": f"{len(files) - len(tracked)} of {len(files)} poses are infinite: left out",
+            **checked.choices,
+        },
         cameras={} if camera is None else {"color": camera},
         missing=[f"color/{file.stem}" for file in files if file.stem not in images],
         beside=images.values(),
@@ -91,20 +98,22 @@ def read_replica(source: Path) -> Capture:
         InputError: for a file that is missing or damaged.
     """
     table = read_table(source / "traj.txt", 16, _MATRIX, may_lack_fix=True)
-    world_from_cam = validate_se3(table.numbers.reshape(-1, 4, 4), table.where)
+    checked = validate_se3(table.numbers.reshape(-1, 4, 4), table.where)
     images = [image for image in pictures(source / "results") if image.name.startswith("frame")]
     numbered = {number_of(image): image for image in images}
     camera = _replica_camera(source)
     name = folder_name(source)
     posed, missing = [], []
-    for row, pose in enumerate(world_from_cam):
+    for row, pose in enumerate(checked.poses):
         if row in numbered:
-            posed.append(Posed(numbered[row], name, pose, None if camera is None else "frame"))
+            camera_name, fault = None if camera is None else "frame", checked.faults.get(row, "")
+            posed.append(Posed(numbered[row], name, pose, camera_name, fault=fault))
         else:
             missing.append(f"results/frame{row:06d}")
     cameras = {} if camera is None else {"frame": camera}
+    choices = {**_CHOICES, **checked.choices}
     return build_capture(
-        "replica", source, posed, unit="metre", choices=_CHOICES, cameras=cameras, missing=missing, beside=images
+        "replica", source, posed, unit="metre", choices=choices, cameras=cameras, missing=missing, beside=images
     )
 
 

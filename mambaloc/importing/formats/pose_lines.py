@@ -18,13 +18,21 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, PICTURES, pictures
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole, validate_se3
+from mambaloc.importing.formats.builder import (
+    Checked,
+    Matrices,
+    Posed,
+    build_capture,
+    from_quaternions,
+    pinhole,
+    validate_se3,
+)
+from mambaloc.importing.formats.finding import count_there, find_pictures
 from mambaloc.importing.formats.parsing import (
     Table,
     as_numbers,
     first_with_pictures,
     folder_name,
-    inside,
     pictures_beside,
     read_lines,
 )
@@ -44,12 +52,13 @@ def is_pose_lines(source: Path) -> bool:
     return bool(_files(source))
 
 
-def read_pose_lines(source: Path, direction: Direction | None = None) -> Capture:
+def read_pose_lines(source: Path, direction: Direction | None = None, images: Path | None = None) -> Capture:
     """Read a file of poses.
 
     Args:
         source: the file, or its folder.
         direction: in which its poses transform; as the module says unless given.
+        images: the folder of the images; found beside the file unless given.
 
     Raises:
         InputError: for a file that is damaged, can be read in more ways than one, or does not fit its pictures.
@@ -64,12 +73,17 @@ def read_pose_lines(source: Path, direction: Direction | None = None) -> Capture
         raise InputError(f"{path}: has 7 numbers a line, which do not say whose pose each is. {_TABLE}")
     if not layout.is_named:
         how = {**_CHOICES, **_by_column(layout)}
-        return read_in_order(path, layout, "pose_lines", how, direction or "world_from_cam")
-    return _read_named(path, layout, direction)
+        return read_in_order(path, layout, "pose_lines", how, direction or "world_from_cam", images)
+    return _read_named(path, layout, direction, images)
 
 
 def read_in_order(
-    path: Path, layout: Layout, kind: str, choices: Mapping[str, str], direction: Direction = "world_from_cam"
+    path: Path,
+    layout: Layout,
+    kind: str,
+    choices: Mapping[str, str],
+    direction: Direction = "world_from_cam",
+    given: Path | None = None,
 ) -> Capture:
     """Read matrices without names, which are those of the pictures beside their file, in natural order.
 
@@ -79,30 +93,36 @@ def read_in_order(
         kind: of the capture.
         choices: made so far.
         direction: in which poses transform.
+        given: the folder of the images; found beside the file unless given.
 
     Raises:
         InputError: for a file that is damaged, or another number of pictures.
     """
     table = read_rows(path, layout, " ".join(["number"] * layout.count))
-    folder = first_with_pictures([path.parent / name for name in IMAGE_FOLDERS])
+    folder = first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS])
     images = pictures(folder)
     if len(images) != len(table.lines):
         raise InputError(
             f"{path}: has {len(table.lines)} poses, and {folder} {len(images)} images; give as many, in the same "
             "order, or write each picture's name before its pose"
         )
-    poses = towards_world(_transforms(table, layout), direction)
+    checked = validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
+    poses = towards_world(checked.poses, direction)
     sequence = folder_name(path.parent)
     return build_capture(
         kind,
         path.parent,
-        [Posed(image, sequence, pose) for image, pose in zip(images, poses, strict=True)],
+        [
+            Posed(image, sequence, pose, fault=checked.faults.get(row, ""))
+            for row, (image, pose) in enumerate(zip(images, poses, strict=True))
+        ],
         unit="unknown",
         choices={
             **choices,
             "direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD,
             "scale": _CHOICES["scale"],
             "association": "in the order of file names",
+            **checked.choices,
         },
     )
 
@@ -114,26 +134,28 @@ def _files(source: Path) -> dict[Path, Layout]:
     return {} if layout is None else {source: layout}
 
 
-def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capture:
+def _read_named(path: Path, layout: Layout, direction: Direction | None, given: Path | None) -> Capture:
     table = read_rows(path, layout, f"name and {layout.count} numbers")
     if layout.count == 7:
-        world_from_cam, told = _of_sevens(table, layout, direction)
+        checked, direction, told = _of_sevens(table, layout, direction)
     else:
         direction = direction or "world_from_cam"
-        world_from_cam = towards_world(_transforms(table, layout), direction)
+        checked = validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
         told = {"direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD}
         told |= _by_column(layout)
-    rows, how, missing = _pictures_of(path, table)
+    world_from_cam = towards_world(checked.poses, direction)
+    rows, how, missing = _pictures_of(path, table, given)
     cameras = _cameras(path.parent / "intrinsics.txt")
     names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras.values()))}
     camera_of = {name: names[camera] for name, camera in cameras.items()}
     posed = [
         Posed(
             image,
-            _sequence(image, path.parent),
+            _sequence(image, given or path.parent),
             world_from_cam[row],
-            camera_of.get(image.relative_to(path.parent).as_posix()),
+            camera_of.get(table.words[row].replace("\\", "/")),
             time_s,
+            fault=checked.faults.get(row, ""),
         )
         for image, row, time_s in rows
     ]
@@ -142,15 +164,15 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None) -> Capt
         path,
         sorted(posed, key=lambda each: each.time_s or 0.0),
         unit="unknown",
-        choices={**_CHOICES, **told, "association": how},
+        choices={**_CHOICES, **told, "association": how, **checked.choices},
         cameras={name: camera for camera, name in names.items()},
         missing=missing,
         beside=pictures_beside(image for image, _, _ in rows),
     )
 
 
-def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tuple[Matrices, dict[str, str]]:
-    """Poses of a position and a quaternion, and what was decided of them."""
+def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tuple[Checked, Direction, dict[str, str]]:
+    """Poses of a position and a quaternion, in which direction they transform, and what was decided of them."""
     comes_first = layout.quaternion == 0
     if layout.is_unclear:
         raise InputError(f"{table.path}: its header does not say where the scalar of the quaternions is. {_TABLE}")
@@ -164,16 +186,10 @@ def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tup
     position = table.numbers[:, 4:] if comes_first else table.numbers[:, :3]
     if scalar == "last":
         quaternion = np.roll(quaternion, 1, axis=1)
-    poses, mended = from_quaternions(position, quaternion, table.where)
+    checked = from_quaternions(position, quaternion, table.where)
     direction = direction or ("cam_from_world" if comes_first else "world_from_cam")
     told = {"direction": f"{_WORLD_FROM_CAM if direction == 'world_from_cam' else _CAM_FROM_WORLD}, scalar {scalar}"}
-    if mended:
-        told["quaternions"] = f"{mended} of {len(table.lines)} were not of unit length, and made so"
-    return towards_world(poses, direction), told
-
-
-def _transforms(table: Table, layout: Layout) -> Matrices:
-    return validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
+    return checked, direction, told
 
 
 def towards_world(poses: Matrices, direction: Direction) -> Matrices:
@@ -181,18 +197,20 @@ def towards_world(poses: Matrices, direction: Direction) -> Matrices:
     return poses if direction == "world_from_cam" else np.linalg.inv(poses).astype(np.float64)
 
 
-def _pictures_of(path: Path, table: Table) -> tuple[list[tuple[Path, int, float | None]], str, list[str]]:
+def _pictures_of(
+    path: Path, table: Table, given: Path | None
+) -> tuple[list[tuple[Path, int, float | None]], str, list[str]]:
     """Each picture with its row and time, how they were associated, and the names whose pictures are not there."""
+    folders = [given] if given else [path.parent, *(path.parent / name for name in IMAGE_FOLDERS[:-1])]
     if all(PurePosixPath(word).suffix.lower() in PICTURES for word in table.words):
-        root = path.parent
-        places = [
-            [inside(folder, word, table.where(row)) for row, word in enumerate(table.words)]
-            for folder in (root, *(root / name for name in IMAGE_FOLDERS[:-1]))
+        folder = max(folders, key=lambda each: count_there(each, table.words))
+        found = find_pictures(folder, [(word, table.where(row)) for row, word in enumerate(table.words)])
+        missing = [word for word, file in zip(table.words, found.files, strict=True) if file in found.missing]
+        frames: list[tuple[Path, int, float | None]] = [
+            (file, row, None) for row, file in enumerate(found.files) if file not in found.missing
         ]
-        files = max(places, key=lambda each: sum(file.is_file() for file in each))
-        missing = [word for word, file in zip(table.words, files, strict=True) if not file.is_file()]
-        return [(file, row, None) for row, file in enumerate(files) if file.is_file()], "by name", missing
-    images = pictures(first_with_pictures([path.parent / name for name in IMAGE_FOLDERS]))
+        return frames, "; ".join(filter(None, ("by name", found.elsewhere))), missing
+    images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, table.words, path)
     return pairing.frames, pairing.how, pairing.missing
 

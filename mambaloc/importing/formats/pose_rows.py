@@ -16,7 +16,7 @@ import numpy as np
 
 from mambaloc.errors import InputError
 from mambaloc.images import PICTURES, pictures
-from mambaloc.importing.formats.builder import Matrices, is_mark
+from mambaloc.importing.formats.builder import LONGEST, SHORTEST, Matrices, is_mark
 from mambaloc.importing.formats.parsing import Table, as_numbers, read_text
 from mambaloc.runtime.rotations import is_rotation
 
@@ -27,6 +27,7 @@ _LOOKED_AT = 200  # lines
 _LEAST_LINES = 2  # one may be a camera's place on its rig
 _MOST_FILES = 64  # of a folder: more are labels of pictures
 _NEARLY_ALL = 0.9  # of the lines: others may be damaged, and are refused by their line
+_MOST = 0.8
 _TOLERANCE = 0.02  # of lengths and of entries of R R^T
 _HEADERS = 3
 _AFTER_PICTURE = re.compile(rf"(.*?(?:{'|'.join(map(re.escape, PICTURES))}))[\s,;]+(.+)", re.IGNORECASE)
@@ -121,19 +122,35 @@ def _layout(rows: Sequence[tuple[str, list[str]]], header: tuple[str, ...]) -> L
         return None
     table = numbers.reshape(len(usual), count)
     if count == 7:
-        places = {place: _unit_rows(table, table[:, place : place + 4]) for place in (3, 0)}
-        place = max(places, key=lambda each: places[each])
-        return Layout(is_named, is_text, 7, quaternion=place, header=header) if places[place] else None
+        place = _place_of_quaternion(table)
+        return None if place is None else Layout(is_named, is_text, 7, quaternion=place, header=header)
     by_column = is_by_column(table)
     return None if by_column is None else Layout(is_named, is_text, count, by_column)
 
 
-def _unit_rows(poses: Matrices, quaternions: Matrices) -> int:
-    """How many quaternions have unit length, where nearly all do that are no marks; 0 otherwise."""
-    quaternions = quaternions[~is_mark(poses, quaternions)]
+def _place_of_quaternion(table: Matrices) -> int | None:
+    """Where four of seven numbers are a quaternion: of unit length in nearly all lines, or of one that is made so."""
+    lengths = {place: _lengths(table, place) for place in (3, 0)}
+    units = {place: int((np.abs(length - 1) < _TOLERANCE).sum()) for place, length in lengths.items()}
+    place = max(units, key=lambda each: units[each])
+    if units[place] >= max(_NEARLY_ALL * len(lengths[place]), 1):
+        return place
+    possible = [place for place, length in lengths.items() if _have_one_length(length)]
+    return max(possible, key=lambda each: units[each], default=None)
+
+
+def _have_one_length(length: Matrices) -> bool:
+    """Whether most quaternions have the usual length, and nearly all may be made units."""
+    usual = float(np.median(length)) if len(length) else 0.0
+    are_usual, may_be = np.abs(length - usual) < _TOLERANCE * usual, (length >= SHORTEST) & (length <= LONGEST)
+    return len(length) > 0 and bool(are_usual.mean() >= _MOST and may_be.mean() >= _NEARLY_ALL)
+
+
+def _lengths(table: Matrices, place: int) -> Matrices:
+    """Of four numbers of each line that is no mark."""
+    quaternions = table[:, place : place + 4]
     with np.errstate(over="ignore"):
-        are_unit = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < _TOLERANCE
-    return int(are_unit.sum()) if are_unit.sum() >= _NEARLY_ALL * len(quaternions) else 0
+        return np.linalg.norm(quaternions[~is_mark(table, quaternions)], axis=1)
 
 
 def is_by_column(table: Matrices) -> bool | None:

@@ -18,11 +18,12 @@ from mambaloc.errors import InputError
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
+from mambaloc.importing.formats.finding import find_pictures
 from mambaloc.importing.formats.parsing import (
     Table,
     first_with_pictures,
     folder_name,
-    inside,
+    pictures_beside,
     read_lines,
 )
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS, Layout, layout_of, pose_files, read_rows
@@ -37,29 +38,35 @@ def is_tum_rgbd(source: Path) -> bool:
     return (source / "rgb.txt").is_file() and (source / "groundtruth.txt").is_file()
 
 
-def read_tum_rgbd(source: Path) -> Capture:
+def read_tum_rgbd(source: Path, images: Path | None = None) -> Capture:
     """Read a recording's ``rgb.txt`` and ``groundtruth.txt``.
+
+    Args:
+        source: the recording's folder.
+        images: the folder of the images that ``rgb.txt`` names; the recording's own unless given.
 
     Raises:
         InputError: for a file that is missing or damaged, or where nothing can be associated.
     """
     listing, (table, layout) = source / "rgb.txt", _read_trajectory(source / "groundtruth.txt")
-    images, words_of, missing = [], [], []
+    named, words_of = [], []
     for line, words in read_lines(listing, "a line each: timestamp file"):
         if len(words) != 2 or stamps_of(words[:1]) is None:
             raise InputError(f"{listing}, line {line}: is no line 'timestamp file'; correct or remove it")
-        image = inside(source, words[1], f"{listing}, line {line}")
-        if image.is_file():
-            images.append(image)
-            words_of.append(words[0])
-        else:
-            missing.append(words[1])
-    stamps = stamps_of(words_of)
+        named.append((words[1], f"{listing}, line {line}"))
+        words_of.append(words[0])
+    if not named:
+        raise InputError(f"{listing}: names no image; add lines 'timestamp file'")
+    found = find_pictures(images or source, named)
+    there = [row for row, file in enumerate(found.files) if file not in found.missing]
+    stamps = stamps_of([words_of[row] for row in there])
     if stamps is None:
-        raise InputError(f"{listing}: names no image that is there, of {len(missing)}; add them")
+        raise InputError(f"{listing}: has time stamps in no unit that is known; correct them")
     pairs, how = by_time(listing, stamps, table.words, table.path)
-    beside = [*images, *pictures(source / "rgb")]
-    rows = [(images[i], j, float(stamps.seconds[i])) for i, j in pairs]
+    how = "; ".join(filter(None, (how, found.elsewhere)))
+    missing = [name for (name, _), file in zip(named, found.files, strict=True) if file in found.missing]
+    beside = pictures_beside(found.files[row] for row in there)
+    rows = [(found.files[there[i]], j, float(stamps.seconds[i])) for i, j in pairs]
     return _capture("tum_rgbd", source, (table, layout), rows, how, missing, beside)
 
 
@@ -125,7 +132,7 @@ def _capture(
     table, layout = trajectory
     scalar, said = layout.scalar or "last", "its header says" if layout.scalar else "the format has them"
     quaternion = table.numbers[:, 3:] if scalar == "first" else np.roll(table.numbers[:, 3:], 1, axis=1)
-    world_from_cam, mended = from_quaternions(table.numbers[:, :3], quaternion, table.where)
+    checked = from_quaternions(table.numbers[:, :3], quaternion, table.where)
     unit: Unit = "metre" if kind == "tum_rgbd" else "unknown"
     choices = {
         "axes": "OpenCV camera axes, as the format has them",
@@ -133,11 +140,13 @@ def _capture(
         "scale": "metres, as the benchmark has them" if unit == "metre" else "unknown: a trajectory does not tell",
         "origin": "kept",
         "association": how,
+        **checked.choices,
     }
-    if mended:
-        choices["quaternions"] = f"{mended} of {len(table.lines)} were not of unit length, and made so"
     if all(time_s is not None for _, _, time_s in rows):
         rows = sorted(rows, key=lambda row: row[2] or 0.0)
     sequence = folder_name(source)
-    posed = [Posed(image, sequence, world_from_cam[row], time_s=time_s) for image, row, time_s in rows]
+    posed = [
+        Posed(image, sequence, checked.poses[row], time_s=time_s, fault=checked.faults.get(row, ""))
+        for image, row, time_s in rows
+    ]
     return build_capture(kind, source, posed, unit=unit, choices=choices, missing=missing, beside=beside)

@@ -105,12 +105,13 @@ class Chosen:
     warning: str
 
 
-def choose(proposals: Sequence[Proposal], asked: str) -> Chosen:
+def choose(proposals: Sequence[Proposal], asked: str, capture: Capture) -> Chosen:
     """Take a proposal: the one asked for, or by :data:`RULE`.
 
     Args:
         proposals: in the order of :data:`KINDS`.
         asked: of :data:`ASKED`.
+        capture: that they split.
 
     Raises:
         InputError: where there is none of the kind that was asked for.
@@ -119,8 +120,9 @@ def choose(proposals: Sequence[Proposal], asked: str) -> Chosen:
         taken = next((each for each in proposals if each.kind == asked), None)
         if taken is None:
             there = ", ".join(each.kind for each in proposals)
-            raise InputError(f"--split {asked}: this capture has {_LACKS[asked]}; choose one of auto, {there}")
-        return Chosen(taken, "it was asked for", _warning(taken))
+            lacks = _lacks_given(capture) if asked == "given" else _LACKS[asked]
+            raise InputError(f"--split {asked}: this capture has {lacks}; choose one of auto, {there}")
+        return Chosen(taken, "it was asked for", _warning(taken, capture))
     given = next((each for each in proposals if each.kind == "given"), None)
     taken = given or next((each for each in proposals if each.is_good), None) or best_of(proposals)
     if given:
@@ -129,15 +131,22 @@ def choose(proposals: Sequence[Proposal], asked: str) -> Chosen:
         why = "the first that is honest and learnable"
     else:
         why = "none is both honest and learnable, it comes nearest"
-    return Chosen(taken, why, _warning(taken))
+    return Chosen(taken, why, _warning(taken, capture))
 
 
 _LACKS = {
-    "given": "no split of its own",
     "sequence": "one sequence",
     "loop": "no path that comes back",
     "block": "too few frames",
 }
+
+
+def _lacks_given(capture: Capture) -> str:
+    """Why a capture's own split is none."""
+    if capture.split is None:
+        return capture.split_concern or "no split of its own"
+    counts = " and ".join(f"{capture.split.count(split)} {split} frames" for split in ("train", "test"))
+    return f"a split of its own with {counts} whose poses and pictures can be used, and both are needed"
 
 
 def best_of(proposals: Sequence[Proposal]) -> Proposal:
@@ -174,15 +183,18 @@ def _quantiles(values: NDArray[np.float64]) -> Quantiles:
     return low, middle, high
 
 
-def _warning(taken: Proposal) -> str:
+def _warning(taken: Proposal, capture: Capture) -> str:
+    listed = f"the capture has {capture.split_concern}" if capture.split_concern else ""
     if not taken.is_honest:
-        return (
+        warning = (
             f"the split by {taken.kind} leaks: {taken.near:.0%} of test frames are within {NEAR_STEPS:g} steps of a "
             "training frame, so test errors will look better than those between the frames"
         )
-    if not taken.is_learnable:
-        return (
+    elif not taken.is_learnable:
+        warning = (
             f"the split by {taken.kind} asks much: half of its test frames are {taken.steps[1]:.0f} steps or more "
             f"({taken.turn_deg[1]:.0f}°) from any training frame; record more passes"
         )
-    return ""
+    else:
+        warning = ""
+    return "; ".join(filter(None, (listed, warning)))

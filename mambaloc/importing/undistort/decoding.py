@@ -8,9 +8,9 @@ whose images stb_image decodes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +41,20 @@ class Decoding:
 
     Args:
         kind: the capture's format.
-        upright: poses mean upright pixels; otherwise those that the files hold.
-        oriented: how many pictures have an EXIF orientation other than upright.
-        count: how many there are.
+        upright: poses mean upright pixels; otherwise those that the files hold. A camera's size may say otherwise of
+            its own pictures.
+        count: how many pictures there are.
         counts: black and white of 16-bit pictures; None where there are none.
+        turned: pictures with an EXIF orientation that were turned upright.
+        stored: pictures with one that were taken as stored.
     """
 
     kind: str
     upright: bool = False
-    oriented: int = 0
     count: int = 0
     counts: Counts | None = None
+    turned: tuple[Path, ...] = ()
+    stored: tuple[Path, ...] = ()
 
     def ways(self, data: bytes) -> Iterator[Image | str]:
         """A file's picture as its pose most likely means it, and then the other way round, where there is one."""
@@ -59,16 +62,24 @@ class Decoding:
         if orientation_of(data) >= _SIDEWAYS:
             yield decode_image(data, not self.upright, self.counts)
 
+    def decided(self, is_upright: Mapping[Path, bool]) -> Decoding:
+        """The same, with how pictures were taken in the end."""
+        of = {path: is_upright.get(path, self.upright) for path in (*self.turned, *self.stored)}
+        turned, stored = (tuple(path for path, is_ in of.items() if is_ == wanted) for wanted in (True, False))
+        return replace(self, turned=turned, stored=stored)
+
     def choices(self) -> dict[str, str]:
         """What was decided, by name."""
-        if self.oriented == 0:
-            said = {"pixels": "as stored; no picture has an EXIF orientation"}
-        elif self.upright:
-            said = {"pixels": f"upright, as the cameras' sizes say: {self.oriented} of {self.count} were turned"}
-        else:
+        said = []
+        if self.turned:
+            said.append(f"upright, as the cameras' sizes say: {self._some(self.turned)} were turned")
+        if self.stored:
             why = f"as {self.known} reads them" if self.known else "taken so: the format does not say"
-            said = {"pixels": f"as stored, {why}; {self.oriented} of {self.count} have an EXIF orientation, dropped"}
-        return {**said, **choices_of(self.counts)}
+            said.append(f"as stored, {why}; {self._some(self.stored)} have an EXIF orientation, dropped")
+        return {"pixels": "; ".join(said) or "as stored; no picture has an EXIF orientation", **choices_of(self.counts)}
+
+    def _some(self, paths: Sequence[Path]) -> str:
+        return f"{len(paths)} of {self.count} pictures (such as {paths[0].name})"
 
     @property
     def known(self) -> str | None:
@@ -96,7 +107,9 @@ def decoding_of(capture: Capture) -> Decoding:
     oriented = [row for row, (orientation, _) in enumerate(heads) if orientation != 1]
     deep = [image for image, (_, is_deep) in zip(images, heads, strict=True) if is_deep]
     sideways = [row for row in oriented if heads[row][0] >= _SIDEWAYS]
-    return Decoding(capture.kind, _are_upright(capture, sideways), len(oriented), len(images), counts_of(deep))
+    upright, paths = _are_upright(capture, sideways), tuple(images[row] for row in oriented)
+    turned, stored = (paths, ()) if upright else ((), paths)
+    return Decoding(capture.kind, upright, len(images), counts_of(deep), turned, stored)
 
 
 def counts_of(paths: Sequence[Path]) -> Counts | None:

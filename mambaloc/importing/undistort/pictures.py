@@ -59,19 +59,21 @@ def write_pictures(capture: Capture, folder: Path) -> Written:
     for parent in {target.parent for target in targets}:
         parent.mkdir(parents=True, exist_ok=True)
 
-    def write(row: int, crop: Size | None = None) -> Size | str:
+    def write(row: int, crop: Size | None = None) -> tuple[Size, bool] | str:
         name = None if capture.camera_of is None else capture.camera_of[row]
         return _write(capture.images[row], targets[row], decoding, cameras, name, crop)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = pool.map(write, range(len(targets)))
         written = list(track(results, "Writing images", len(targets), console=Console(stderr=True), transient=True))
-        taken = {row: size for row, size in enumerate(written) if not isinstance(size, str)}
+        done = {row: each for row, each in enumerate(written) if not isinstance(each, str)}
+        taken = {row: size for row, (size, _) in done.items()}
         common = common_sizes(taken.values())
         odd = [row for row, size in taken.items() if size != common[size]]
         list(pool.map(write, odd, [common[taken[row]] for row in odd]))
     rules = {str(capture.images[row]): rule for row, rule in enumerate(written) if isinstance(rule, str)}
     kept = selected(capture, list(taken))
+    decoding = decoding.decided({capture.images[row]: is_upright for row, (_, is_upright) in done.items()})
     names, pinholes, lenses = cameras.as_used(kept.camera_of, list(taken.values()), common)
     said = _said(capture.cameras, lenses, len(odd), len(taken))
     images, choices = tuple(targets[row] for row in taken), {**capture.choices, **decoding.choices(), **said}
@@ -113,8 +115,8 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
 
 def _write(
     source: Path, target: Path, decoding: Decoding, cameras: FittedCameras, name: str | None, crop: Size | None
-) -> Size | str:
-    """Write an image, or the middle of it, and return its (width, height), or the rule that it breaks."""
+) -> tuple[Size, bool] | str:
+    """Write an image, or the middle of it: its (width, height) and whether it is upright, or the rule it breaks."""
     try:
         data = source.read_bytes()
     except OSError:
@@ -135,7 +137,7 @@ def _write(
     is_upright = decoding.upright == (image is first)
     if maps is None and crop is None and (copy := _untagged(data, is_upright)) and target.suffix in _KEPT_SUFFIXES:
         target.write_bytes(copy)
-        return _size(image)
+        return _size(image), is_upright
     if maps is not None:
         # The border's last hundredth of a pixel is rounding, and nothing to be black.
         image = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
@@ -143,7 +145,7 @@ def _write(
         image = center_cropped(image, crop[::-1])
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if target.suffix != ".png" else []
     target.write_bytes(cv2.imencode(target.suffix, image[..., ::-1], options)[1].tobytes())
-    return _size(image)
+    return _size(image), is_upright
 
 
 def _untagged(data: bytes, is_upright: bool) -> bytes | None:

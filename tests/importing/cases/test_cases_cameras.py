@@ -70,6 +70,16 @@ def test_cameras_scale_to_smaller_pictures(imported, folder):
     assert "160x120" in said["choices"]["scaled cameras"]
 
 
+def test_smaller_pictures_with_another_suffix(tmp_path):
+    shutil.copytree(CASES / "smaller-pictures/capture-4", tmp_path / "capture")
+    for picture in (tmp_path / "capture/images_4").iterdir():
+        cv2.imwrite(str(picture.with_suffix(".png")), cv2.imread(str(picture)))
+        picture.unlink()
+    import_scene(tmp_path / "capture", tmp_path / "scene")
+    truth = true_poses(CASES / "smaller-pictures/truth.txt").items()
+    assert_true(scene_poses(tmp_path / "scene"), {f"{Path(name).stem}.png": pose for name, pose in truth})
+
+
 @pytest.mark.parametrize(("kind", "size"), [("same-shape", (96, 72)), ("two-shapes", (128, 72))])
 def test_two_devices_are_read_each_with_its_camera(imported, tmp_path, kind, size):
     said = imported(f"two-resolutions/capture-{kind}")

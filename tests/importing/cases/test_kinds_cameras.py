@@ -179,6 +179,45 @@ def test_links_that_lead_out_are_not_searched(tmp_path):
         find_pictures(tmp_path / "root", [("/home/user/images/key.png", "here")])
 
 
+def made(root: Path, *paths: str) -> Path:
+    for path in paths:
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).touch()
+    return root
+
+
+@pytest.mark.parametrize(
+    ("name", "files", "place"),
+    [
+        ("images/1.jpg", ["images_4/1.png"], "images_4/1.png"),
+        ("images/1.jpg", ["images_8/1.png", "images_2/1.png"], "images_2/1.png"),
+        ("C:\\scans\\images\\1.jpg", ["room/images_4/1.png", "depth/1.png"], "room/images_4/1.png"),
+        ("images/1.JPG", ["1.webp", "depth/1.png"], "1.webp"),
+        ("images/1.jpg", ["images/1.png", "images_4/1.jpg"], "images_4/1.jpg"),
+    ],
+)
+def test_a_picture_with_another_suffix_is_found_by_its_stem(tmp_path, name, files, place):
+    found = find_pictures(made(tmp_path, *files), [(name, "here")])
+    assert found.files == (tmp_path / place,)
+    assert found.missing == frozenset()
+    assert found.elsewhere.endswith(f" is {place}") or Path(name).name == Path(place).name
+
+
+def test_a_stem_of_several_pictures_or_of_another_folder_is_not_taken(tmp_path):
+    """A folder of another name may hold depth."""
+    made(tmp_path, "images_4/1.png", "images_4/1.webp", "depth/2.png", "cam/3.jpg", "cam_2/3.jpg")
+    with pytest.raises(InputError, match=r"may be images_4/1\.png or images_4/1\.webp"):
+        find_pictures(tmp_path, [("images/1.jpg", "here")])
+    with pytest.raises(InputError, match=r"^\S+: has no image with a pose; 1 are named and missing") as refusal:
+        find_pictures(tmp_path, [("images/2.jpg", "here")])
+    assert str(refusal.value).count("--images") == 1
+    made(tmp_path, "masks/4.jpg")
+    with pytest.raises(InputError, match=r"has no image with a pose; 1 are named and missing, such as '4\.jpg'"):
+        find_pictures(tmp_path, [("4.jpg", "here")])
+    with pytest.raises(InputError, match=r"may be cam/3\.jpg or cam_2/3\.jpg"):
+        find_pictures(tmp_path, [("3.jpg", "here")])
+
+
 # --- texts of COLMAP -------------------------------------------------------------------------------------------------
 
 NAMES = st.text(string.ascii_letters + string.digits + " ()[]{}#,;'-_äß日", min_size=1, max_size=12).map(

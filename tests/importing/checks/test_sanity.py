@@ -79,6 +79,7 @@ def test_pictures_on_their_side():
     for pose, pitch in zip(poses, np.linspace(-60, 60, len(poses)), strict=True):
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("x", pitch, degrees=True).as_matrix()
     assert "lie on their side" in check_up(capture_of(poses), up_of(capture_of(poses))).concern
+    assert not check_up(capture_of(poses), up_of(capture_of(poses)), are_contradicted=True).concern
 
 
 @pytest.mark.parametrize(("inwards", "said"), [(True, "meet in front of"), (False, "meet behind")])
@@ -123,6 +124,16 @@ def test_shuffled_frames_follow_no_path():
     assert not motion.in_order
     assert motion.step == pytest.approx(2 * 2.0 * np.sin(np.pi / 60))  # to the nearest frame
     assert "in no order of time" in sanity.check_steps(capture, motion, "m").concern
+
+
+def test_a_pose_that_stays_is_named_with_its_frames():
+    poses = poses_at(line(60))
+    poses[50:] = poses[49]
+    finding = sanity.check_duplicates(capture_of(poses), motion_of(capture_of(poses)))
+    assert "stood still in 11 successive frames, 0049.png to 0059.png; remove these if" in finding.concern
+    split = capture_of(poses, sequences=tuple(f"seq-{row}" for row in range(60)))
+    assert "successive" not in sanity.check_duplicates(split, motion_of(split)).concern
+    assert not finding.is_fatal
 
 
 def test_duplicates_are_counted():

@@ -96,7 +96,7 @@ def test_record3d_frames_are_found_by_their_number(record3d, recording):
         ({"poses": [[0, 0, 0, 1, 0, 0, "far"]]}, "'poses' must be N x 7 finite numbers"),
         ({"poses": {"0": 1}}, "'poses' must be N x 7 finite numbers"),
         ({"poses": [[0, 0, 0, 1, 0, 0, 0]] * 6}, "all 6 poses are the same; record with the LiDAR camera"),
-        ({"poses": [[0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0.1, 1, 0, 0]]}, "poses, row 1: the quaternion is far from unit"),
+        ({"poses": [[0, 0, 0, 9, 2, 0, 0], [0, 0, 0, 0.1, 1, 0, 0]]}, "poses, row 0: the quaternion is far from unit"),
         ({"K": [1, 2]}, "'K' must be 9 finite numbers"),
         ({"K": [0] * 9}, "must have a size and finite, positive focal lengths"),
         ({"K": [58.0, 0, 33.0, 0, 59.0, 25.0, 0, 0, 1]}, "principal point -0, -0 is far from the centre"),  # row-major
@@ -158,8 +158,20 @@ def test_optimised_polycam_poses_are_preferred(polycam, recording, place):
     np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-12)
     np.testing.assert_allclose(capture.time_s, np.array(STAMPS) / 1e6)
     assert {path.parent.name for path in capture.images} == {"corrected_images"}
+    assert capture.choices["poses"] == "6 optimised by the app"
     (camera,) = capture.cameras.values()
     assert (camera.focal_px, camera.centre_px) == ((58, 58), (32.5, 24.5))
+
+
+def test_which_polycam_poses_were_taken_is_stated(polycam, recording):
+    (polycam / "keyframes/corrected_cameras" / f"{STAMPS[3]}.json").unlink()
+    capture = read_polycam(polycam)
+    assert capture.choices["poses"] == "5 optimised by the app; not read: 1 that it did not optimise"
+    np.testing.assert_allclose(capture.world_from_cam, np.delete(recording.world_from_cam, 3, axis=0), atol=1e-12)
+    (polycam / "keyframes/corrected_images").rename(polycam / "hidden")
+    capture = read_polycam(polycam)
+    assert "corrected_images, which are missing" in capture.choices["poses"]
+    np.testing.assert_allclose(capture.world_from_cam[:, 0, 3], recording.position_m[:, 0] + 0.1)
 
 
 def test_arkit_poses_are_taken_where_none_were_optimised(polycam, recording):
@@ -178,7 +190,6 @@ def test_arkit_poses_are_taken_where_none_were_optimised(polycam, recording):
     ("change", "says"),
     [
         ({"t_00": None}, "'t_00 to t_23' must be 12 finite numbers"),
-        ({"t_00": 2}, "the pose's rotation is not orthonormal"),
         ({"t_23": float("inf")}, "'t_00 to t_23' must be 12 finite numbers"),
         ({"fx": 0}, "must have a size and finite, positive focal"),
         ({"cx": "wide"}, "'fx, fy, cx, cy' must be 4 finite numbers"),
@@ -192,6 +203,18 @@ def test_polycam_damage_is_named_in_one_line(polycam, recording, refused, change
     refused(read_polycam, polycam, says, str(damaged))
     damaged.write_text(damaged.read_text()[:30])
     refused(read_polycam, polycam, "is no JSON", str(damaged))
+
+
+def test_a_polycam_matrix_that_is_no_rotation_is_left_out_by_name(polycam, recording):
+    whole = read_polycam(polycam)
+    file = polycam / "keyframes" / "corrected_cameras" / f"{STAMPS[2]}.json"
+    file.write_text(keyframe(arkit(recording.world_from_cam)[2], t_00=2))
+    capture = read_polycam(polycam)
+    kept = [row for row, image in enumerate(whole.images) if image.stem != str(STAMPS[2])]
+    np.testing.assert_allclose(capture.world_from_cam, whole.world_from_cam[kept])
+    ((name, rule),) = capture.left_out.items()
+    assert name.endswith(f"{STAMPS[2]}.jpg")
+    assert rule == f"the pose's rotation is not orthonormal ({file})"
 
 
 def test_a_polycam_folder_without_cameras(polycam, refused):

@@ -203,6 +203,14 @@ def test_lists_name_frames_as_programs_write_them(write, tmp_path, lists, split,
     assert capture.split == split
     assert capture.choices.get("split", "").startswith(said or "")
     assert ("split" in capture.choices) == (said is not None)
+    assert ("'9.png' is listed, 'i/1.png' is a frame" in capture.split_concern) == ("9.png" in lists["train"])
+
+
+def test_lists_that_name_no_frame_are_stated_with_a_name_of_each_side(write, tmp_path):
+    write(["i/1.png", "i/2.png"], train_filenames=["cam1/a.png"], test_filenames=["cam1/b.png"])
+    capture = read_capture(tmp_path)
+    said = "lists of names that are of none of its frames ('cam1/a.png' is listed, 'i/1.png' is a frame)"
+    assert (capture.split, capture.split_concern) == (None, said)
 
 
 def test_a_listed_name_of_two_frames_is_neither(write, tmp_path):
@@ -220,7 +228,9 @@ def test_a_frame_without_a_matrix_has_no_pose(write, tmp_path):
 def test_a_split_of_images_that_are_not_there_is_none(write, tmp_path):
     names = ("images/a_1.png", "images/a_2.png")
     write(names, absent=names[:1], train_filenames=names[:1])
-    assert read_capture(tmp_path).split is None
+    capture = read_capture(tmp_path)
+    assert capture.split is None
+    assert capture.split_concern.startswith("a split of its own that names none of the frames")
 
 
 def test_a_pose_that_is_not_known_stays_for_the_checks(write, tmp_path):
@@ -254,10 +264,6 @@ BAD = {
     "frame 1: file_path: names 'C:\\\\a.png', which is no file inside of": frame("file_path", "C:\\a.png"),
     "aaaaaa', which is no file inside of": frame("file_path", "a" * 253),  # too long with a suffix
     "images/a_2.png more than one pose; remove all but one": frame("file_path", "images/a_2.png"),
-    "frame 1: transform_matrix is no 4x4 or 3x4 matrix": frame("transform_matrix", [[1, 2], [3, 4]]),
-    "frame 1: transform_matrix is no 4x4 or 3x4 matrix ": frame("transform_matrix", "none"),
-    "frame 1: transform_matrix is no 4x4 or 3x4 matrix  ": frame("transform_matrix", [["a"] * 4] * 4),
-    "frame 1: transform_matrix's last row is not 0 0 0 1": frame("transform_matrix", [[1, 0, 0, 0]] * 4),
     "tells a focal length of some frames, not of": lambda told: frame("fl_x", 30.0)(without(told, "fl_x")),
     "camera of a_1.png: fl_x is 'wide', no finite number": frame("fl_x", "wide"),
     "camera of a_1.png: fl_x is 'nan', no finite number": frame("fl_x", math.nan),
@@ -274,6 +280,34 @@ BAD = {
     "applied_transform is no 4x4": top(applied_transform="z up"),
     "train_filenames is no list": top(train_filenames=3),
 }
+
+
+MALFORMED = {
+    "frame 1: transform_matrix is no 4x4 or 3x4 matrix": [[1, 2], [3, 4]],
+    "frame 1: transform_matrix is no 4x4 or 3x4 matrix ": "none",
+    "frame 1: transform_matrix is no 4x4 or 3x4 matrix  ": [["a"] * 4] * 4,
+    "frame 1: transform_matrix's last row is not 0 0 0 1": [[1, 0, 0, 0]] * 4,
+}
+
+
+@pytest.mark.parametrize(("message", "matrix"), MALFORMED.items())
+def test_a_malformed_matrix_leaves_its_frame_out_and_all_of_them_are_refused(write, tmp_path, message, matrix):
+    write(**FOCAL)
+    whole = read_capture(tmp_path)
+    file = tmp_path / "transforms.json"
+    told = json.loads(file.read_text())
+    told["frames"][0]["transform_matrix"] = matrix
+    file.write_text(json.dumps(told))
+    capture = read_capture(tmp_path)
+    np.testing.assert_array_equal(capture.world_from_cam, whole.world_from_cam[1:])
+    ((name, rule),) = capture.left_out.items()
+    assert name == str(tmp_path / "images/a_1.png")
+    assert message.strip() in rule
+    for each in told["frames"]:
+        each["transform_matrix"] = matrix
+    file.write_text(json.dumps(told))
+    with pytest.raises(InputError, match=re.escape(message.strip())):
+        read_capture(tmp_path)
 
 
 @pytest.mark.parametrize(("message", "change"), BAD.items())

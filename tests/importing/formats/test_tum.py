@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from recorded import FRAMES
 
+from mambaloc.errors import InputError
 from mambaloc.importing.formats.timing import associated
 from mambaloc.importing.formats.tum import read_tum, read_tum_rgbd
 from mambaloc.importing.registry import read_capture
@@ -57,6 +58,21 @@ def test_what_is_missing_is_told(tum, recording):
     np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam[[0, 1, 3, 4]], atol=1e-8)
     assert capture.poses_without_image == (f"rgb/{images[2].name}",)
     assert capture.images_without_pose == (images[5],)
+
+
+def test_images_are_found_by_the_ends_of_their_paths(tum, recording, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("pictures") / "elsewhere"
+    lines = (tum / "rgb.txt").read_text().splitlines()
+    moved = [line.replace("rgb/", "/home/user/tum/rgb/") for line in lines]
+    (tum / "rgb.txt").write_text("\n".join(moved))
+    capture = read_capture(tum)
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-8)
+    assert "6 of 6 by the ends of their paths" in capture.choices["association"]
+    (tum / "rgb").rename(elsewhere)
+    with pytest.raises(InputError, match="--images"):
+        read_capture(tum)
+    found = read_capture(tum, images=elsewhere)
+    np.testing.assert_allclose(found.world_from_cam, recording.world_from_cam, atol=1e-8)
 
 
 def greedy(first, second, most):
@@ -140,14 +156,14 @@ def test_quaternions_that_are_not_unit_are_made_so_and_counted(tum, recording):
         ("groundtruth.txt", "x 2 3 4 0 0 0 1\n", "no time stamp in seconds"),
         ("groundtruth.txt", "\x00\xff\n", "line 1: is no line"),
         ("rgb.txt", None, "rgb.txt: missing"),
-        ("rgb.txt", "", "names no image that is there, of 0"),
+        ("rgb.txt", "", "names no image; add lines"),
         ("rgb.txt", "1305031102.2 ../../etc/passwd\n", "names '../../etc/passwd', which is no file inside of"),
         ("rgb.txt", "1305031102.2 /etc/passwd\n", "names '/etc/passwd', which is no file inside of"),
         ("rgb.txt", "1305031102.2 C:\\x.png\n", "which is no file inside of"),
         ("rgb.txt", "1305031102.2\n", "line 1: is no line 'timestamp file'"),
         ("rgb.txt", "nan rgb/a.png\n", "line 1: is no line 'timestamp file'"),
         ("rgb.txt", f"1 {'a' * 300}.png\n", "which is no file inside of"),
-        ("rgb.txt", "1 rgb/a.png\n", "names no image that is there, of 1"),
+        ("rgb.txt", "1 rgb/a.png\n", "1 are named and missing, such as 'rgb/a.png'"),
     ],
 )
 def test_damage_is_named_in_one_line(tum, refused, file, content, says):

@@ -56,7 +56,7 @@ def test_one_straight_recording_is_split_by_blocks():
     gaps = np.abs(test[:, None] - train).min(axis=1)
     assert gaps.min() == 5  # two in a hundred frames are left out on either side
     assert block.steps[1] == pytest.approx(np.median(gaps))
-    assert choose(list(found.values()), "auto").proposal is block
+    assert choose(list(found.values()), "auto", capture).proposal is block
 
 
 def test_validation_frames_are_as_far_from_training_as_test_frames():
@@ -78,19 +78,20 @@ def test_a_path_that_comes_back_is_split_by_a_pass():
     for row in test:  # the other pass sees it from as good as there
         assert np.abs((angle[train] - angle[row] + 180) % 360 - 180).min() <= 3
     assert np.abs(test[:, None] - train).min() > 2
-    chosen = choose(list(found.values()), "auto")
+    chosen = choose(list(found.values()), "auto", capture)
     assert chosen.proposal is loop
     assert not chosen.warning
 
 
 @pytest.mark.parametrize("poses", [poses_at(line(240)), laps(240, 0.9)], ids=["straight", "an open circle"])
 def test_a_path_that_does_not_come_back_has_no_loop(poses):
-    found = proposals_of(capture_of(poses))
+    capture = capture_of(poses)
+    found = proposals_of(capture)
     assert "loop" not in found
     with pytest.raises(
         InputError, match="--split loop: this capture has no path that comes back; choose one of auto, block"
     ):
-        choose(list(found.values()), "loop")
+        choose(list(found.values()), "loop", capture)
 
 
 def test_a_way_back_that_looks_the_other_way_is_no_loop():
@@ -108,7 +109,7 @@ def test_recordings_are_split_whole():
     tested = {name for name, part in zip(names, split, strict=True) if part == "test"}
     assert len(tested) == 1
     assert all(part == "test" for name, part in zip(names, split, strict=True) if name in tested)
-    assert choose(list(found.values()), "auto").proposal.kind == "sequence"
+    assert choose(list(found.values()), "auto", capture).proposal.kind == "sequence"
 
 
 def test_a_given_split_of_every_eighth_frame_leaks_and_is_taken_with_a_warning():
@@ -119,10 +120,26 @@ def test_a_given_split_of_every_eighth_frame_leaks_and_is_taken_with_a_warning()
     assert not found["given"].is_honest
     assert found["given"].steps[1] == pytest.approx(1)
     for asked in ("auto", "given"):
-        chosen = choose(list(found.values()), asked)
+        chosen = choose(list(found.values()), asked, capture)
         assert chosen.proposal.kind == "given"
         assert "of test frames are within 2 steps" in chosen.warning
-    assert choose([each for each in found.values() if each.kind != "given"], "auto").proposal.kind == "block"
+    assert choose([each for each in found.values() if each.kind != "given"], "auto", capture).proposal.kind == "block"
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({}, "this capture has no split of its own;"),
+        ({"split_concern": "lists of names"}, "this capture has lists of names;"),
+        ({"split": ("train",) * 60}, "a split of its own with 60 train frames and 0 test frames whose poses and"),
+    ],
+)
+def test_a_given_split_that_is_none_is_refused_with_its_reason(given, says):
+    capture = capture_of(poses_at(line(60)), **given)
+    proposals = list(proposals_of(capture).values())
+    with pytest.raises(InputError, match=f"--split given: .*{says}"):
+        choose(proposals, "given", capture)
+    assert choose(proposals, "auto", capture).warning.startswith("the capture has lists") == ("split_concern" in given)
 
 
 def test_a_given_split_keeps_its_validation_frames():
@@ -137,7 +154,7 @@ def test_a_split_out_of_reach_is_told():
     proposal = measured("block", "by hand", split, capture, motion_of(capture))
     assert proposal.is_honest
     assert not proposal.is_learnable
-    chosen = choose([proposal], "auto")
+    chosen = choose([proposal], "auto", capture)
     assert "asks much" in chosen.warning
     assert "none is both" in chosen.why
 

@@ -85,7 +85,22 @@ def test_one_picture_that_lies_says_what_the_others_mean(tmp_path):
     written = write_pictures(capture, tmp_path / "out")
     expected = np.asarray(Image.open(images[1]))[::-1, ::-1].astype(int)
     assert np.abs(np.asarray(Image.open(written.capture.images[1])).astype(int) - expected).mean() < 5
-    assert written.capture.choices["pixels"] == "upright, as the cameras' sizes say: 2 of 2 were turned"
+    said = "upright, as the cameras' sizes say: 2 of 2 pictures (such as lying.jpg) were turned"
+    assert written.capture.choices["pixels"] == said
+
+
+def test_pictures_that_were_decided_differently_are_counted_apart(tmp_path):
+    """Two phones in one table: the camera of one is shaped as its stored pictures, that of the other is not."""
+    images = [tagged(tmp_path, f"{row}.jpg", (32, 24), tag, row) for row, tag in enumerate([6, 8, 1, 6])]
+    capture = captured("csv", images, (32, 24))
+    tall = Camera(24, 32, (30.0, 30.0), (11.5, 15.5))
+    capture = replace(capture, cameras={**capture.cameras, "tall": tall}, camera_of=("one", "tall", "one", "tall"))
+    written = write_pictures(capture, tmp_path / "out")
+    assert [Image.open(image).size for image in written.capture.images] == [(32, 24), (24, 32), (32, 24), (24, 32)]
+    said = written.capture.choices["pixels"]
+    assert "2 of 4 pictures (such as 1.jpg) were turned" in said
+    assert "1 of 4 pictures (such as 0.jpg) have an EXIF orientation, dropped" in said
+    assert check_pixels(written.decoding).concern.startswith("1 pictures have an EXIF orientation")
 
 
 def test_a_training_and_a_map_refuse_a_picture_that_may_be_either_way_round(tmp_path):
