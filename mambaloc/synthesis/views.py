@@ -6,6 +6,8 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -87,11 +89,26 @@ def make_views(
     if not folder.is_dir():
         splatter, sampler = Splatter(source, device), PoseSampler(world_from_cam, source.median_depth_m, spread)
         parts = [folder.parent / f"part-{start // PART:04d}" for start in range(0, count, PART)]
-        for number, part in enumerate(progress(parts, "views", len(parts))):
-            if not part.is_dir():
-                _write(part, _accepted(splatter, sampler, intrinsics, size, (seed, number)))
+        left = [number for number, part in enumerate(parts) if not part.is_dir()]
+        with _side_by_side(splatter.device) as pool:
+            made = pool.map(lambda number: _accepted(splatter, sampler, intrinsics, size, (seed, number)), left)
+            for number, views in zip(left, progress(made, "views", len(left)), strict=True):
+                _write(parts[number], views)
         _join(parts, count, folder)
     return Views(*(np.load(folder / f"{name}.npy", mmap_mode="r") for name in _FIELDS))
+
+
+@contextmanager
+def _side_by_side(device: torch.device) -> Iterator[ThreadPoolExecutor]:
+    """Threads that make a part each, as many as PyTorch has on a CPU: operations on one view are too small to share."""
+    threads = torch.get_num_threads()
+    workers = threads if device.type == "cpu" else 1
+    pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)  # waits for the parts in hand, a second each
+        torch.set_num_threads(threads)  # the threads' setting is that of all new ones
 
 
 def _name(source: PosedDepth, world_from_cam: Floats, *settings: object) -> str:
