@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ _VERSION = 5
 _NEAREST = 0.1  # median depths; nearer surfaces would fill the view with a few pixels of a frame
 _MOST_CROWDED = 0.02  # share of pixels nearer than that
 _DRAWN = 64  # poses at once
+_RENDERED = 16  # of these at once, until there are enough
 _LEAST_KEPT = 0.02
 _REMEDY = "make room, or choose another folder"
 
@@ -129,13 +131,13 @@ def _accepted(
     while len(kept) < PART:
         poses = sampler.draw(_DRAWN, rng)
         tried += _DRAWN
-        kept += supported(splatter, poses, intrinsics, size)
+        kept += islice(supported(splatter, poses, intrinsics, size), PART - len(kept))
         if tried > PART and len(kept) < _LEAST_KEPT * tried:
             raise InputError(
                 f"depth of {len(splatter.source)} frames: supports {len(kept)} of {tried} views. "
                 "Give depth to more frames, or do without views."
             )
-    images, depth_m, world_from_cam = (np.stack(values) for values in zip(*kept[:PART], strict=True))
+    images, depth_m, world_from_cam = (np.stack(values) for values in zip(*kept, strict=True))
     return Views(images, depth_m, np.repeat(intrinsics[None].astype(np.float64), PART, axis=0), world_from_cam)
 
 
@@ -143,14 +145,14 @@ def supported(
     splatter: Splatter, world_from_cam: Floats, intrinsics: Floats, size: tuple[int, int]
 ) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float16], Floats]]:
     """Render views; yield picture, depth and pose of those with few holes, whose camera is before the surfaces."""
-    poses = world_from_cam[splatter.is_free(world_from_cam[:, :3, 3])]
-    if not len(poses):
-        return
-    views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, most_holes=MOST_HOLES)
-    crowded_share = (views.depth_m < _NEAREST * splatter.scale_m).float().mean(dim=(1, 2))
-    is_good = (views.hole_share <= MOST_HOLES) & (crowded_share <= _MOST_CROWDED)
-    for row in is_good.nonzero()[:, 0].tolist():
-        yield views.images[row].cpu().numpy(), views.depth_m[row].half().cpu().numpy(), poses[row]
+    free = world_from_cam[splatter.is_free(world_from_cam[:, :3, 3])]
+    for start in range(0, len(free), _RENDERED):
+        poses = free[start : start + _RENDERED]
+        views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, most_holes=MOST_HOLES)
+        crowded_share = (views.depth_m < _NEAREST * splatter.scale_m).float().mean(dim=(1, 2))
+        is_good = (views.hole_share <= MOST_HOLES) & (crowded_share <= _MOST_CROWDED)
+        for row in is_good.nonzero()[:, 0].tolist():
+            yield views.images[row].cpu().numpy(), views.depth_m[row].half().cpu().numpy(), poses[row]
 
 
 def _write(folder: Path, views: Views) -> None:
