@@ -23,6 +23,8 @@ _SAME_SURFACE = 0.05  # of the depth
 _EDGE = 0.05  # of the depth, over three pixels
 _NEAR = 0.02  # of the median depth
 _FIRST = 4  # frames, in which a view's surfaces are looked up before the others
+_NOWHERE = 1e30  # depth that no frame has
+_AT_ONCE = 4  # views; more would not fit a core's cache
 
 
 @dataclass(frozen=True)
@@ -49,15 +51,22 @@ class Splatter:
     def __init__(self, source: PosedDepth, device: torch.device | str = "cpu") -> None:
         self.source, self.device = source, torch.device(device)
         self.scale_m = source.median_depth_m
-        self._depth_m = without_edges(torch.from_numpy(source.depth_m).to(self.device))
-        self._colors = torch.from_numpy(source.images).to(self.device).flatten(2).transpose(1, 2).reshape(-1, 3)
-        y, x = torch.meshgrid(
-            *(torch.arange(length, device=self.device) for length in source.depth_m.shape[1:]), indexing="ij"
-        )
-        board = (x + y) % 2 == 0  # half of the pixels; cracks between them are closed
-        self._board_m = self._depth_m[:, board]
-        self._pixels = torch.stack((x[board], y[board], torch.ones_like(x[board])))[:, None].float()
+        depth_m = without_edges(torch.from_numpy(source.depth_m).to(self.device))
+        self._padded_m = F.pad(depth_m, (1, 1, 1, 1), value=torch.nan).flatten()
+        self._colors = torch.from_numpy(source.images).to(self.device).flatten()
+        self._center_m = source.world_from_cam[:, :3, 3].mean(axis=0)  # far from the origin, float32 is coarse
+        self._points_m = [self._lifted(row, depth_m[row]) for row in range(len(source))]
         self._pixel_from_world = source.intrinsics @ np.linalg.inv(source.world_from_cam)[:, :3]
+
+    def _lifted(self, row: int, depth_m: Tensor) -> Tensor:
+        """Points (3, P) of half of a frame's pixels, like a chessboard's, from the centre; cracks are closed later."""
+        y, x = depth_m.isfinite().nonzero().T
+        is_black = (x + y) % 2 == 0
+        y, x = y[is_black], x[is_black]
+        pose, matrix = self.source.world_from_cam[row], np.linalg.inv(self.source.intrinsics[row])
+        rays = torch.stack((x, y, torch.ones_like(x))) * depth_m[y, x]
+        world_from_pixel, position_m = pose[:3, :3] @ matrix, pose[:3, 3] - self._center_m
+        return torch.addmm(self._tensor(position_m)[:, None], self._tensor(world_from_pixel), rays)
 
     def nearest(self, world_from_cam: Floats, allowed: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
         """The frames that see most alike, the best first.
@@ -108,99 +117,109 @@ class Splatter:
         frames = self.nearest(world_from_cam, allowed)
         matrix, shift = between(self.source, frames, world_from_cam, intrinsics)
         back = np.linalg.inv(matrix)
-        back_shift = -np.einsum("vnij,vnj->vni", back, shift)
+        to_frames = self._tensor(np.concatenate((back, -back @ shift[..., None]), axis=-1))
+        view_from_world = intrinsics @ np.linalg.inv(world_from_cam)[:, :3]
+        view_from_world[..., 3] += view_from_world[..., :3] @ self._center_m
+        to_view, pixels = self._tensor(view_from_world), self._pixels(size)
         views = []
-        for row, rows in enumerate(frames):  # one by one: more would not fit a core's cache
-            few = slice((rows >= 0).sum())
-            there, cameras = (matrix[row, few], shift[row, few]), (back[row, few], back_shift[row, few])
-            views.append(self._view(rows[few], there, cameras, size, most_holes))
-        images, depth_m = (torch.stack(each) for each in zip(*views, strict=True))
+        for start in range(0, len(frames), _AT_ONCE):
+            some = slice(start, start + _AT_ONCE)
+            each = [rows[rows >= 0] for rows in frames[some]]
+            views.append(self._views(each, to_view[some], to_frames[some], pixels, most_holes))
+        images, depth_m = (torch.cat(each) for each in zip(*views, strict=True))
         return Rendered(images, depth_m, depth_m.isnan().float().mean(dim=(1, 2)))
 
-    def _view(
-        self,
-        rows: NDArray[np.int64],
-        there: tuple[Floats, Floats],
-        back: tuple[Floats, Floats],
-        size: tuple[int, int],
-        most_holes: float,
+    def _views(
+        self, frames: list[NDArray[np.int64]], to_view: Tensor, to_frames: Tensor, pixels: Tensor, most_holes: float
     ) -> tuple[Tensor, Tensor]:
-        """Picture (3, H, W) and depth (H, W) of a view from N frames, by matrices and shifts to it and to these."""
-        frame = torch.from_numpy(rows).to(self.device)
-        nearest = closed(self._z_buffer(frame, self._tensor(there[0]), self._tensor(there[1]), size))
-        image, depth_m = torch.zeros(3, *size, device=self.device), torch.full_like(nearest, torch.nan)
-        if nearest.isinf().float().mean() <= most_holes:
-            cameras = self._tensor(back[0]), self._tensor(back[1])
-            self._look_up(frame, *cameras, nearest, image.flatten(1), depth_m.flatten())
-            if depth_m.isnan().float().mean() <= most_holes:
-                image = filled(image[None], depth_m.isfinite()[None, None].to(image))[0]
-        return image.clamp_(0, 255).round_().byte(), depth_m
-
-    def _z_buffer(self, frame: Tensor, matrix: Tensor, shift: Tensor, size: tuple[int, int]) -> Tensor:
-        """Depth (H, W) of the nearest point of N frames on each pixel of a view; infinite where there is none."""
-        height, width = size
-        x, y, z = seen_from(matrix, shift, self._pixels * self._board_m[frame])
-        x, y = x.div_(z).round_(), y.div_(z).round_()
-        is_inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (z > _NEAR * self.scale_m)  # NaN is outside
-        pixel = torch.where(is_inside, y.mul_(width).add_(x), height * width).long()
-        nearest = z.new_full((height * width + 1,), torch.inf)
-        nearest.scatter_reduce_(0, pixel.flatten(), z.flatten(), "amin")
-        return nearest[:-1].reshape(size)
-
-    def _look_up(
-        self, frame: Tensor, matrix: Tensor, shift: Tensor, nearest: Tensor, image: Tensor, depth_m: Tensor
-    ) -> None:
-        """Fill in colours (3, H * W) and depth (H * W,) of each surface from the first frame that sees it.
+        """Pictures (V, 3, H, W) and depth (V, H, W) of views.
 
         Args:
-            frame: N of them, the best first.
-            matrix: what carries the view's pixels times their depth to each, (N, 3, 3).
-            shift: likewise, (N, 3).
-            nearest: depth of each pixel, (H, W); infinite where there is none.
-            image: changed in place.
-            depth_m: likewise.
+            frames: rows of those that each is made from, at most N, the best first.
+            to_view: what carries world points to its pixels times their depth, (V, 3, 4).
+            to_frames: what carries its pixels times their depth to its frames' times theirs, (V, N, 3, 4).
+            pixels: (3, H, W), homogeneous.
+            most_holes: see :meth:`render`.
         """
-        left = nearest.flatten().isfinite().nonzero()[:, 0]
-        for few in (slice(_FIRST), slice(_FIRST, None)):  # most surfaces are seen by the first
-            if not len(left) or not len(frame[few]):
-                break
-            z = nearest.flatten()[left]
-            points = torch.stack(((left % nearest.shape[1]) * z, (left // nearest.shape[1]) * z, z))
-            is_known, rank, x, y, ratio = self._first_that_sees(frame[few], matrix[few], shift[few], points)
-            found = left[is_known]
-            depth_m[found] = (z * ratio)[is_known]
-            image[:, found] = self._colors_at(frame[few][rank[is_known]], x[is_known], y[is_known])
-            left = left[~is_known]
+        size = pixels.shape[1:]
+        nearest = closed(torch.stack([self._z_buffer(*each, size) for each in zip(frames, to_view, strict=True)]))
+        images, depth_m = nearest.new_zeros(len(frames), 3, *size), torch.full_like(nearest, torch.nan)
+        shares = nearest.isinf().float().mean(dim=(1, 2))
+        for view in ((shares <= most_holes) & (shares < 1)).nonzero()[:, 0].tolist():
+            images[view], depth_m[view] = self._look_up(frames[view], to_frames[view], nearest[view], pixels)
+        is_kept = depth_m.isnan().float().mean(dim=(1, 2)) <= most_holes
+        images[is_kept] = filled(images[is_kept], depth_m[is_kept, None].isfinite().to(images))
+        return images.clamp_(0, 255).round_().byte(), depth_m
 
-    def _first_that_sees(
-        self, frame: Tensor, matrix: Tensor, shift: Tensor, points: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Whether points (3, P) are seen by any of N frames, by which first, at which x and y, and how much farther."""
-        height, width = self.source.depth_m.shape[1:]
-        x, y, z = seen_from(matrix, shift, points[:, None])
+    def _z_buffer(self, frames: NDArray[np.int64], to_view: Tensor, size: torch.Size) -> Tensor:
+        """Depth (H, W) of the nearest point of some frames on each pixel of a view; infinite where there is none."""
+        height, width = size
+        buffer = to_view.new_full(((height + 2) * (width + 2),), torch.inf)  # a border takes what lies outside
+        if len(frames):
+            points_m = torch.cat([self._points_m[row] for row in frames], dim=1)
+            x, y, z = torch.addmm(to_view[:, 3:], to_view[:, :3], points_m)
+            torch.threshold_(z, _NEAR * self.scale_m, torch.inf)
+            x.div_(z).round_().clamp_(-1, width)
+            y.div_(z).round_().clamp_(-1, height)
+            buffer.scatter_reduce_(0, y.mul_(width + 2).add_(x).add_(width + 3).long(), z, "amin")
+        return buffer.view(height + 2, width + 2)[1:-1, 1:-1]
+
+    def _look_up(
+        self, frames: NDArray[np.int64], to_frames: Tensor, nearest: Tensor, pixels: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Colours (3, H, W) and depth (H, W) of a view's surfaces as the first of N frames that sees each does.
+
+        Colours are 0 and depth is NaN where none does; the arguments are those of :meth:`_views`, of one view.
+        """
+        frame = torch.from_numpy(frames).to(self.device)
+        z = nearest.flatten().clamp(max=_NOWHERE)
+        points = pixels.flatten(1) * z
+        seen = self._first_that_sees(frame[:_FIRST], to_frames[:_FIRST], points)  # most surfaces
+        if len(frame) > _FIRST:
+            left = (seen[3].isnan() & nearest.flatten().isfinite()).nonzero()[:, 0]
+            others = self._first_that_sees(frame[_FIRST:], to_frames[_FIRST:], points.index_select(1, left))
+            seen.index_copy_(1, left, others)
+        image = self._colors_at(*seen[:3])
+        image *= seen[3].isfinite()
+        return image.view(3, *nearest.shape), z.mul_(seen[3]).view_as(nearest)
+
+    def _first_that_sees(self, frame: Tensor, to_frames: Tensor, points: Tensor) -> Tensor:
+        """Which of N frames sees points (3, P) first, at which x and y, and how much farther, NaN where none does.
+
+        The four are the rows of (4, P); ``to_frames`` is (N or more, 3, 4).
+        """
+        (height, width), (count, size) = self.source.depth_m.shape[1:], (len(frame), points.shape[1])
+        rotated = (to_frames[:count, :, :3].transpose(0, 1).reshape(-1, 3) @ points).view(3, count, size)
+        x, y, z = rotated.add_(to_frames[:count, :, 3].T[..., None])
+        torch.threshold_(z, 0, torch.inf)
         x, y = x.div_(z), y.div_(z)
-        column, row = x.round(), y.round()
-        is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
-        pixel = torch.where(is_inside, row.mul_(width).add_(column), 0).long()
-        pixel += frame[:, None] * (height * width)
-        ratio = self._depth_m.take(pixel).div_(z)
-        agrees = is_inside & ((ratio - 1).abs_() < _SAME_SURFACE)
-        is_known, rank = agrees.byte().max(dim=0)  # the first of equals
-        x, y, ratio = (values.gather(0, rank[None])[0] for values in (x, y, ratio))
-        return is_known.bool(), rank, x, y, ratio
+        pixel = y.round().clamp_(-1, height).mul_(width + 2).add_(x.round().clamp_(-1, width)).int()
+        pixel += ((frame * (height + 2) + 1) * (width + 2) + 1).int()[:, None]
+        ratio = torch.div(self._padded_m.index_select(0, pixel.flatten()).view_as(z), z, out=z)
+        agrees = (ratio - 1).abs_() < _SAME_SURFACE
+        order = torch.arange(count, 0, -1, dtype=torch.uint8, device=self.device)[:, None]
+        best = (agrees * order).amax(dim=0)  # the first has the highest
+        rank = count - best.clamp(min=1).int()
+        chosen = rank * size + torch.arange(size, dtype=torch.int32, device=self.device)
+        x, y, ratio = (each.flatten().index_select(0, chosen) for each in (x, y, ratio))
+        return torch.stack((frame.index_select(0, rank).float(), x, y, torch.where(best > 0, ratio, torch.nan)))
 
     def _colors_at(self, frame: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Colours of frames at points; all (P,) -> (3, P)."""
+        """Colours of frames between pixels; all (P,) -> (3, P)."""
         height, width = self.source.depth_m.shape[1:]
-        x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
-        left, top = x.long().clamp(max=width - 2), y.long().clamp(max=height - 2)
-        right, below = (x - left)[:, None], (y - top)[:, None]
-        corner = (frame * height + top) * width + left
+        x, y = x.clamp_(0, width - 1), y.clamp_(0, height - 1)
+        left, top = x.int().clamp_(max=width - 2), y.int().clamp_(max=height - 2)
+        corner = (frame.int() * (3 * height) + top) * width + left
+        beside = torch.tensor([0, 1, width, width + 1], dtype=torch.int32, device=self.device)[:, None]
+        channel = torch.arange(3, dtype=torch.int32, device=self.device)[:, None, None] * (height * width)
+        corners = self._colors.index_select(0, (corner + beside + channel).flatten()).float().view(3, 2, 2, -1)
+        row = torch.lerp(corners[:, :, 0], corners[:, :, 1], x - left)
+        return torch.lerp(row[:, 0], row[:, 1], y - top)
 
-        def between(pixel: Tensor) -> Tensor:
-            return torch.lerp(self._colors[pixel].float(), self._colors[pixel + 1].float(), right)
-
-        return torch.lerp(between(corner), between(corner + width), below).T
+    def _pixels(self, size: tuple[int, int]) -> Tensor:
+        """Homogeneous pixels (3, H, W)."""
+        y, x = torch.meshgrid(*(torch.arange(length, device=self.device) for length in size), indexing="ij")
+        return torch.stack((x, y, torch.ones_like(x))).float()
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.from_numpy(values).to(self.device, torch.float32)
@@ -232,15 +251,6 @@ def carried(matrix: Tensor, shift: Tensor, size: tuple[int, ...], depth_m: Tenso
     pixels = torch.stack((x, y, torch.ones_like(x))).flatten(1).to(matrix)
     rays = (matrix.reshape(-1, 3) @ pixels).reshape(*matrix.shape[:3], -1)
     return rays.mul_(depth_m).add_(shift[..., None])
-
-
-def seen_from(matrix: Tensor, shift: Tensor, points: Tensor) -> Tensor:
-    """Pixels times their depth, in N other cameras: (N, 3, 3), (N, 3), (3, N or 1, P) -> (3, N, P)."""
-    if points.shape[1] == 1:
-        seen = (matrix.transpose(0, 1).reshape(-1, 3) @ points[:, 0]).reshape(3, len(matrix), -1)
-    else:
-        seen = torch.bmm(matrix, points.transpose(0, 1)).transpose(0, 1).contiguous()
-    return seen.add_(shift.T[..., None])
 
 
 def without_edges(depth_m: Tensor) -> Tensor:

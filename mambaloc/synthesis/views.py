@@ -6,7 +6,10 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +33,7 @@ _VERSION = 5
 _NEAREST = 0.1  # median depths; nearer surfaces would fill the view with a few pixels of a frame
 _MOST_CROWDED = 0.02  # share of pixels nearer than that
 _DRAWN = 64  # poses at once
+_RENDERED = 16  # of these at once, until there are enough
 _LEAST_KEPT = 0.02
 _REMEDY = "make room, or choose another folder"
 
@@ -87,11 +91,26 @@ def make_views(
     if not folder.is_dir():
         splatter, sampler = Splatter(source, device), PoseSampler(world_from_cam, source.median_depth_m, spread)
         parts = [folder.parent / f"part-{start // PART:04d}" for start in range(0, count, PART)]
-        for number, part in enumerate(progress(parts, "views", len(parts))):
-            if not part.is_dir():
-                _write(part, _accepted(splatter, sampler, intrinsics, size, (seed, number)))
+        left = [number for number, part in enumerate(parts) if not part.is_dir()]
+        with _side_by_side(splatter.device) as pool:
+            made = pool.map(lambda number: _accepted(splatter, sampler, intrinsics, size, (seed, number)), left)
+            for number, views in zip(left, progress(made, "views", len(left)), strict=True):
+                _write(parts[number], views)
         _join(parts, count, folder)
     return Views(*(np.load(folder / f"{name}.npy", mmap_mode="r") for name in _FIELDS))
+
+
+@contextmanager
+def _side_by_side(device: torch.device) -> Iterator[ThreadPoolExecutor]:
+    """Threads that make a part each, as many as PyTorch has on a CPU: operations on one view are too small to share."""
+    threads = torch.get_num_threads()
+    workers = threads if device.type == "cpu" else 1
+    pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)  # waits for the parts in hand, a second each
+        torch.set_num_threads(threads)  # the threads' setting is that of all new ones
 
 
 def _name(source: PosedDepth, world_from_cam: Floats, *settings: object) -> str:
@@ -112,13 +131,13 @@ def _accepted(
     while len(kept) < PART:
         poses = sampler.draw(_DRAWN, rng)
         tried += _DRAWN
-        kept += supported(splatter, poses, intrinsics, size)
+        kept += islice(supported(splatter, poses, intrinsics, size), PART - len(kept))
         if tried > PART and len(kept) < _LEAST_KEPT * tried:
             raise InputError(
                 f"depth of {len(splatter.source)} frames: supports {len(kept)} of {tried} views. "
                 "Give depth to more frames, or do without views."
             )
-    images, depth_m, world_from_cam = (np.stack(values) for values in zip(*kept[:PART], strict=True))
+    images, depth_m, world_from_cam = (np.stack(values) for values in zip(*kept, strict=True))
     return Views(images, depth_m, np.repeat(intrinsics[None].astype(np.float64), PART, axis=0), world_from_cam)
 
 
@@ -126,14 +145,14 @@ def supported(
     splatter: Splatter, world_from_cam: Floats, intrinsics: Floats, size: tuple[int, int]
 ) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float16], Floats]]:
     """Render views; yield picture, depth and pose of those with few holes, whose camera is before the surfaces."""
-    poses = world_from_cam[splatter.is_free(world_from_cam[:, :3, 3])]
-    if not len(poses):
-        return
-    views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, most_holes=MOST_HOLES)
-    crowded_share = (views.depth_m < _NEAREST * splatter.scale_m).float().mean(dim=(1, 2))
-    is_good = (views.hole_share <= MOST_HOLES) & (crowded_share <= _MOST_CROWDED)
-    for row in is_good.nonzero()[:, 0].tolist():
-        yield views.images[row].cpu().numpy(), views.depth_m[row].half().cpu().numpy(), poses[row]
+    free = world_from_cam[splatter.is_free(world_from_cam[:, :3, 3])]
+    for start in range(0, len(free), _RENDERED):
+        poses = free[start : start + _RENDERED]
+        views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, most_holes=MOST_HOLES)
+        crowded_share = (views.depth_m < _NEAREST * splatter.scale_m).float().mean(dim=(1, 2))
+        is_good = (views.hole_share <= MOST_HOLES) & (crowded_share <= _MOST_CROWDED)
+        for row in is_good.nonzero()[:, 0].tolist():
+            yield views.images[row].cpu().numpy(), views.depth_m[row].half().cpu().numpy(), poses[row]
 
 
 def _write(folder: Path, views: Views) -> None:

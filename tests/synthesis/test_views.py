@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from mambaloc.errors import InputError
 from mambaloc.synthesis import Spread, make_views, views
@@ -75,6 +76,19 @@ def test_interrupted_making_goes_on_and_ends_the_same(twenty, walk, camera, tmp_
     monkeypatch.setattr(views, "_accepted", None)
     np.testing.assert_array_equal(made(walk, camera, tmp_path).images, twenty.images)  # opened, not made
     assert [each.name for each in next(tmp_path.iterdir()).iterdir()] == ["views-20"]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_views_do_not_depend_on_the_number_of_threads(twenty, walk, camera, tmp_path, threads):
+    usual = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        several = made(walk, camera, tmp_path)
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(usual)
+    for name in views._FIELDS:
+        np.testing.assert_array_equal(getattr(several, name), getattr(twenty, name))
 
 
 def test_other_seed_and_other_frames_make_other_views(twenty, walk, camera, small_parts, tmp_path):

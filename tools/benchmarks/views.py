@@ -1,7 +1,9 @@
 """Measure view synthesis on the training frames of a scene in the layout of 7-Scenes, on one core: depth from pictures
 against the sensor's, views at the poses of held-out frames, and views a second.
 
-python tools/benchmarks/views.py [--root FOLDER] [--scene NAME] [--map FILE] [--out FOLDER]
+The rate counts CPU time, from opening the frames to files on disk. Give --out a new folder: views are made only once.
+
+python tools/benchmarks/views.py [--root FOLDER] [--scene NAME] [--short_side N] [--map FILE] [--out FOLDER]
 """
 
 from __future__ import annotations
@@ -35,7 +37,6 @@ from mambaloc.synthesis import (
 from mambaloc.synthesis.depth_from_pictures import enlarged, range_from_pictures, range_of_points, searched
 from mambaloc.viz.views import draw_views
 
-_SHORT_SIDE = 108
 _VIEWS = 512
 
 
@@ -46,6 +47,7 @@ def main() -> None:
     parser = OptionParser(description=__doc__)
     parser.add_argument("--root", default="../shared/data/7scenes_blocks")
     parser.add_argument("--scene", default="redkitchen")
+    parser.add_argument("--short_side", type=int, default=108, help="of the pictures and the views, in pixels")
     parser.add_argument("--map", type=Path, help="of the training frames, whose adjusted poses and lens are used")
     parser.add_argument("--out", type=Path, default=Path("runs/views"))
     args = parser.parse_args()
@@ -54,10 +56,10 @@ def main() -> None:
     print(provenance.machine())
     frames = read_frames(MapRecipe(args.scene, root=args.root), "train")
     sparse_map = SparseMap.load(args.map) if args.map else None
-    pictures = small(adjusted(frames, sparse_map) if sparse_map else frames)
+    pictures = small(adjusted(frames, sparse_map) if sparse_map else frames, args.short_side)
     sensor, rows = with_sensor(pictures, frames, Path(args.root) / args.scene)
-    compare(pictures, sensor, rows, None if sparse_map is None else sparse_map.points_m)
     measure("sensor", sensor, pictures, args.out)
+    compare(pictures, sensor, rows, None if sparse_map is None else sparse_map.points_m)
     began = time.process_time()
     found = depth_from_pictures(pictures.images, pictures.intrinsics, pictures.world_from_cam)
     print(f"plane sweep of {len(found)} key frames: {time.process_time() - began:.0f} s")
@@ -72,10 +74,10 @@ def adjusted(frames: PosedFrames, sparse_map: SparseMap) -> PosedFrames:
     return PosedFrames(frames.images, frames.intrinsics * scale, np.stack(poses))
 
 
-def small(frames: PosedFrames) -> PosedDepth:
+def small(frames: PosedFrames, short_side: int) -> PosedDepth:
     """All frames, resized, without depth."""
     pictures = [read_image(image) for image in frames.images]  # type: ignore[arg-type]
-    images = np.stack([resized(picture, _SHORT_SIDE).transpose(2, 0, 1) for picture in pictures])
+    images = np.stack([resized(picture, short_side).transpose(2, 0, 1) for picture in pictures])
     scale = np.diag((images.shape[3] / pictures[0].shape[1], images.shape[2] / pictures[0].shape[0], 1))
     scale[:2, 2] = (scale[[0, 1], [0, 1]] - 1) / 2
     depth_m = np.full((len(images), *images.shape[2:]), np.nan, np.float32)
