@@ -9,6 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -27,7 +28,7 @@ from mambaloc.importing.sfm.structure import read_structure
 from mambaloc.rendering import default_intrinsics, furnished_room, render, smooth_trajectory
 from mambaloc.runtime.sources import frames_of
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
 _SIZE = (320, 240)
 _INSIDE_M = ((-1.25, -1.0, 1.1), (1.25, 1.0, 1.7))
@@ -62,7 +63,7 @@ def _measure(seed: int, count: int, work: Path) -> None:
             own = work / mapper.__name__
             own.mkdir()
             shutil.copy(database, own / "database.db")
-            model, taken_s = _timed(lambda mapper=mapper, own=own: mapper(own / "database.db", images, own))
+            model, taken_s = _timed(partial(mapper, own / "database.db", images, own))
             print(f"  {mapper.__name__[1:]}: {taken_s:.2f} s; {_describe(model, world_from_cam)}")
     _, taken_s = _timed(lambda: read_structure(film, threads=1))
     print(f"  all of it, as imported: {taken_s:.2f} s")
