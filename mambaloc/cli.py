@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ from mambaloc.evaluation import evaluate_checkpoint, measure_map_of_run, print_t
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.files import read_yaml, writing
 from mambaloc.models import Checkpoint, LitPoseRegressor
+from mambaloc.recipes import recipe_path
 from mambaloc.refusals import OneLineErrorParser, tell_refusals
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
@@ -54,7 +56,15 @@ class SaveRecipe(SaveConfigCallback):
 
 
 class RecipeCLI(LightningCLI):
-    """LightningCLI whose runs each get a folder, and end with the test errors of the best and the last epoch."""
+    """LightningCLI whose runs each get a folder, and end with the test errors of the best and the last epoch.
+
+    Args:
+        began_s: reading of ``time.monotonic()`` from which a time budget counts; now unless given.
+    """
+
+    def __init__(self, *args: Any, began_s: float | None = None, **kwargs: Any) -> None:
+        self.began_s = time.monotonic() if began_s is None else began_s
+        super().__init__(*args, **kwargs)
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Give every run its callbacks, each a section of the recipe."""
@@ -131,6 +141,12 @@ class RecipeCLI(LightningCLI):
             callbacks = [each for each in callbacks if not isinstance(each, PoseProgressBar)]
         return super()._instantiate_trainer(config, [MovedRun(), *callbacks])
 
+    def before_fit(self) -> None:
+        """Let a time budget begin where the command began."""
+        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+            if isinstance(callback, TimeBudget):
+                callback.began_s = self.began_s
+
     def fit(self, model: L.LightningModule, **kwargs: Any) -> None:
         """Train; an interrupted run says how to go on.
 
@@ -201,7 +217,9 @@ def run_directory(config: Namespace) -> Path:
 
 
 def recipe_arguments(argv: list[str]) -> list[str]:
-    """Turn ``[SUBCOMMAND] RECIPE.yaml [OVERLAY.yaml ...] [--key value ...]`` into LightningCLI's own arguments.
+    """Turn ``[SUBCOMMAND] RECIPE [OVERLAY ...] [--key value ...]`` into LightningCLI's own arguments.
+
+    Recipes are files, or names of those that come with the package.
 
     Raises:
         InputError: where no recipe comes first, or one does not exist.
@@ -210,15 +228,14 @@ def recipe_arguments(argv: list[str]) -> list[str]:
     if words and words[0] in ("-h", "--help"):
         return [subcommand, "--help"]
     recipes = []
-    while words and words[0].endswith((".yaml", ".yml")):
-        if not Path(words[0]).is_file():
-            raise InputError(f"{words[0]}: no such recipe; see recipes/")
-        read_yaml(Path(words[0]), "see recipes/", "correct it")  # before a parser that expands whatever stands there
-        recipes += ["--config", words[0]]
+    while words and not words[0].startswith("-"):
+        recipe = recipe_path(words[0])
+        read_yaml(recipe, "see recipes/", "correct it")  # before a parser that expands whatever stands there
+        recipes += ["--config", str(recipe)]
         words = words[1:]
     if not recipes:
         given = f"before {argv[0]}" if argv else ""
-        raise InputError(f"a recipe comes first{', ' + given if given else ''}: train.py RECIPE.yaml [--key value ...]")
+        raise InputError(f"a recipe comes first{', ' + given if given else ''}: train RECIPE [--key value ...]")
     stray = next((word for word in words if word.endswith((".yaml", ".yml")) and Path(word).is_file()), None)
     if stray and words[words.index(stray) - 1 if words.index(stray) else 0] != "--config":
         raise InputError(f"{stray}: recipes and overlays come before the options; move it to the front")
@@ -226,14 +243,20 @@ def recipe_arguments(argv: list[str]) -> list[str]:
 
 
 @exits_cleanly
-def main(argv: list[str] | None = None) -> RecipeCLI:
-    """Run ``tools/train.py``."""
+def main(argv: list[str] | None = None, began_s: float | None = None) -> RecipeCLI:
+    """Run ``mambaloc train``.
+
+    Args:
+        argv: what follows the command's name; that of this process unless given.
+        began_s: as :class:`RecipeCLI` takes it.
+    """
     quieten()
     argv = sys.argv[1:] if argv is None else argv
     with tell_refusals(argv):
         return RecipeCLI(
             LitPoseRegressor,
             PoseDataModule,
+            began_s=began_s,
             parser_class=OneLineErrorParser,
             subclass_mode_model=True,
             auto_configure_optimizers=False,

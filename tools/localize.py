@@ -1,55 +1,6 @@
-"""Localise pictures: python tools/localize.py [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA [--filter causal|smooth]."""
+"""``mambaloc localize``, from a checkout."""
 
-from pathlib import Path
-
-from mambaloc.console import OptionParser, black_and_white, exits_cleanly, pinhole_matrix, thread_count
-from mambaloc.runtime import Localiser
-from mambaloc.runtime.video import FILTERS, follow
-
-
-@exits_cleanly
-def main() -> None:
-    """Localise every frame and write a trajectory; Ctrl-C ends a camera's."""
-    parser = OptionParser(description=__doc__)
-    parser.add_argument(
-        "model",
-        nargs="?",
-        metavar="MODEL|MAP",
-        help="bundle, exported model, map.safetensors or ARCH.TAG; unless given, the embedded room's",
-    )
-    parser.add_argument("source", help="a video, a picture, a folder of pictures (30 a second), or a camera's number")
-    parser.add_argument("--out", type=Path, default=Path("poses.tum"), help="trajectory to write, TUM format")
-    parser.add_argument("--filter", choices=FILTERS, help="steady a video's poses: from those before, or from all")
-    parser.add_argument(
-        "--intrinsics",
-        type=pinhole_matrix,
-        metavar="FX,FY,CX,CY",
-        help="of the frames, in pixels; the training camera's unless given",
-    )
-    parser.add_argument(
-        "--counts",
-        type=black_and_white,
-        metavar="BLACK,WHITE",
-        help="of 16-bit pictures, as the scene's report.md says; those that use all 16 bits need none",
-    )
-    maps = parser.add_mutually_exclusive_group()
-    maps.add_argument(
-        "--map", dest="sparse_map", default=True, metavar="FILE", help="beside the model; a bundle's own unless given"
-    )
-    maps.add_argument("--no-map", dest="sparse_map", action="store_false", help="let the network answer alone")
-    parser.add_argument("--threads", type=thread_count, help="that the network may use for one image")
-    args = parser.parse_args()
-    localiser = Localiser(_model(args.model), args.threads, args.sparse_map)
-    print(f"{args.out}: {follow(localiser, args.source, args.out, args.filter, args.intrinsics, args.counts)}")
-
-
-def _model(name: str | None) -> Path:
-    if name is not None and (Path(name).exists() or Path(name).suffix in (".onnx", ".ort", ".safetensors")):
-        return Path(name)
-    from mambaloc.zoo.bundles import EMBEDDED, released_bundle  # needs torch, which an exported model does not
-
-    return released_bundle(EMBEDDED if name is None else name)
-
+from mambaloc.commands.localize import main
 
 if __name__ == "__main__":
     main()

@@ -1,45 +1,6 @@
-"""Render a scene: the embedded room, or a room along a dataset's true poses.
+"""``mambaloc render``, from a checkout."""
 
-python tools/render_scene.py OUT [--poses poses.csv --scene heads --layout 7scenes] [--size 320x240] [--limit N]
-"""
-
-from __future__ import annotations
-
-from pathlib import Path
-
-from mambaloc import rendering
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
-from mambaloc.errors import InputError
-
-
-@exits_cleanly
-def main() -> None:
-    """Read the command line and render."""
-    parser = OptionParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder in which the scene's folder is made")
-    parser.add_argument("--poses", type=Path, help="CSV scene,split,image,x,y,z,qw,qx,qy,qz; else the embedded room")
-    parser.add_argument("--scene", help="which scene of the CSV")
-    parser.add_argument("--layout", choices=["7scenes", "cambridge"], help="7scenes unless given")
-    parser.add_argument("--size", help="WIDTHxHEIGHT of the pictures; 320x240 unless given")
-    parser.add_argument("--limit", type=whole_number(1), help="at most so many frames of each split, evenly spaced")
-    parser.add_argument("--seed", type=whole_number(0), help="another seed is another room")
-    args = parser.parse_args()
-    if args.poses is None:
-        given = [name for name in ("scene", "layout", "size", "limit", "seed") if getattr(args, name) is not None]
-        if given:
-            raise InputError(
-                f"--{given[0]}: is of a room along --poses; the embedded room is always the same. Give both."
-            )
-        print(rendering.ensure_embedded_scene(args.out))
-        return
-    if args.scene is None:
-        raise InputError("--poses: holds several scenes; choose one with --scene")
-    layout, size = args.layout or "7scenes", rendering.parse_size(args.size or "320x240")
-    shots = rendering.read_pose_table(args.poses, args.scene, layout)
-    shots = rendering.thinned(shots, len(shots) if args.limit is None else args.limit)
-    write = rendering.write_7scenes if layout == "7scenes" else rendering.write_cambridge
-    print(write(args.out, args.scene, shots, size=size, seed=args.seed or 0))
-
+from mambaloc.commands.render_scene import main
 
 if __name__ == "__main__":
     main()

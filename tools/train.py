@@ -1,10 +1,6 @@
-"""Train a recipe: python tools/train.py RECIPE.yaml [OVERLAY.yaml ...] [--key value ...]."""
+"""``mambaloc train``, from a checkout."""
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: on a map's small matrices threads only wait
-
-from mambaloc.cli import main
+from mambaloc.commands.train import main
 
 if __name__ == "__main__":
     main()

@@ -1,39 +1,6 @@
-"""Draw the paper's figures: python tools/visualize.py KIND CHECKPOINT... [--out FOLDER] [--data.KEY VALUE ...]."""
+"""``mambaloc visualize``, from a checkout."""
 
-from pathlib import Path
-
-from mambaloc.cli import OneLineErrorParser
-from mambaloc.console import exits_cleanly, quieten
-from mambaloc.data import PoseDataModule
-from mambaloc.evaluation.figures import FIGURES, draw_figures
-from mambaloc.evaluation.trained import Trained, load_trained
-from mambaloc.models import Checkpoint
-
-
-@exits_cleanly
-def main(argv: list[str] | None = None) -> None:
-    """Draw trained systems on the test frames of their recipes, changed where an option says so."""
-    quieten()
-    parser = OneLineErrorParser(description=__doc__)
-    parser.add_argument("kind", choices=list(FIGURES), help="trajectory: a figure a system; others: all in one")
-    parser.add_argument("checkpoints", type=Path, nargs="+", metavar="CHECKPOINT")
-    parser.add_argument("--out", type=Path, help="folder of the figures; RUN/figures/EPOCH of the first unless given")
-    parser.add_argument("--frames", type=int, default=3, help="how many test frames are shown, evenly spaced")
-    parser.add_class_arguments(PoseDataModule, "data")
-    args = parser.parse_args(argv, defaults=False)
-    trained = [_trained(parser, argv, path) for path in args.checkpoints]
-    first = args.checkpoints[0]
-    out = args.get("out") or first.parent.parent / "figures" / first.stem
-    for path in draw_figures(args.kind, trained, out, args.get("frames", 3)):
-        print(path)
-
-
-def _trained(parser: OneLineErrorParser, argv: list[str] | None, path: Path) -> Trained:
-    """Load a checkpoint with its own recipe's data under the options that were given."""
-    checkpoint = Checkpoint.read(path)
-    parser.set_defaults({f"data.{name}": value for name, value in checkpoint.data().hparams.items()})
-    return load_trained(checkpoint, PoseDataModule(**parser.parse_args(argv).data))
-
+from mambaloc.commands.visualize import main
 
 if __name__ == "__main__":
     main()

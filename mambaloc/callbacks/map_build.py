@@ -71,7 +71,7 @@ class MapBuild(L.Callback):
         print(
             f"{path}: {describe_points(sparse_map)}, in {len(sparse_map.key_poses)} key frames, "
             f"{path.stat().st_size / 2**20:.2f} MiB, built in {time.perf_counter() - started:.1f} s; "
-            "tools/localize.py localises with it already",
+            "mambaloc localize localises with it already",
             flush=True,
         )
 

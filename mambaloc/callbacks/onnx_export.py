@@ -20,7 +20,7 @@ class OnnxExport(L.Callback):
     Args:
         enabled: whether to.
         bundle: write ``RUN/bundle`` in place of ``RUN/model.onnx``: the model, the run's map, and test vectors, as
-            ``tools/export.py`` does. A resumed run replaces it.
+            ``mambaloc export`` does. A resumed run replaces it.
     """
 
     def __init__(self, enabled: bool = True, bundle: bool = False) -> None:

@@ -23,11 +23,15 @@ class TimeBudget(L.Callback):
     replaces it, and ``model.lr`` is its highest value. A resumed run has a budget of its own.
 
     Args:
-        minutes: from now on, before any frame is read; None trains as the trainer says.
+        minutes: from ``began_s`` on, before any frame is read; None trains as the trainer says.
         reserve_s: seconds of them for tests and export at the end.
 
     Raises:
         InputError: for a budget that leaves no time to train.
+
+    Attributes:
+        began_s: reading of ``time.monotonic()`` from which the budget counts: when it was made, or, in a command,
+            when the process began.
     """
 
     def __init__(self, minutes: float | None = None, reserve_s: float = 30.0) -> None:
@@ -36,8 +40,8 @@ class TimeBudget(L.Callback):
                 f"time_budget.minutes {minutes:g}: must be more than the {reserve_s:g} s of time_budget.reserve_s"
             )
         self.minutes, self.reserve_s = minutes, reserve_s
-        self._made = time.monotonic()
-        self._began = self._ends = 0.0
+        self.began_s = time.monotonic()
+        self._train_began = self._ends = 0.0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Take what the start has left of the budget.
@@ -47,11 +51,11 @@ class TimeBudget(L.Callback):
         """
         if self.minutes is None or trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
-        self._began, self._ends = time.monotonic(), self._made + 60 * self.minutes - self.reserve_s
-        if self._ends <= self._began:
+        self._train_began, self._ends = time.monotonic(), self.began_s + 60 * self.minutes - self.reserve_s
+        if self._ends <= self._train_began:
             raise InputError(
-                f"time_budget.minutes {self.minutes:g}: {self._began - self._made:.0f} s went by before the first "
-                "step. Give more; frames, map and views are kept for the next run."
+                f"time_budget.minutes {self.minutes:g}: {self._train_began - self.began_s:.0f} s went by before the "
+                "first step. Give more; frames, map and views are kept for the next run."
             )
         groups = trainer.optimizers[0].param_groups  # of a resumed run they are where the last cycle ended
         self._highest = [group.get("initial_lr", group["lr"]) for group in groups]
@@ -60,7 +64,7 @@ class TimeBudget(L.Callback):
         """Set the learning rate that belongs to this time."""
         if not self._ends:
             return
-        factor = one_cycle((time.monotonic() - self._began) / (self._ends - self._began))
+        factor = one_cycle((time.monotonic() - self._train_began) / (self._ends - self._train_began))
         for group, highest in zip(trainer.optimizers[0].param_groups, self._highest, strict=True):
             group["lr"] = highest * factor
 

@@ -63,7 +63,7 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
         return _of_model(_of_colmap(colmap, size), colmap, folder, size, frames)
     raise UnknownCameraError(
         f"{folder}: does not give its cameras: there is neither {NVM_FILE} nor a COLMAP model in "
-        f"{' or '.join(COLMAP_FOLDERS)}. Add one of them, or import the scene with tools/import_scene.py."
+        f"{' or '.join(COLMAP_FOLDERS)}. Add one of them, or import the scene with mambaloc import."
     )
 
 

@@ -71,7 +71,7 @@ Camera pose of one RGB image, {contract.pose}.
 - `INTEGRATION.md`: how an app uses it
 - `LICENSE.txt`
 
-`python tools/verify_bundle.py FOLDER` checks it, `python tools/demo.py FOLDER` shows it in a browser. An app ships a
+`mambaloc verify FOLDER` checks it, `mambaloc demo FOLDER` shows it in a browser. An app ships a
 model, the map if there is one, and `contract.json`; `frames/` are for checking a port.
 
 {_world(contract)}{_lens(contract)}## How sure it is
@@ -91,7 +91,7 @@ def _world(contract: Contract) -> str:
 
 The models, the map, `frames/` and `trajectory.json` are in the scene's own frame, so that float32 holds positions.
 Add `world.offset_m` in `contract.json`, {list(contract.world.offset_m)}, to a position **in double precision** for the
-world of the data that the scene was made of. `mambaloc.runtime.Localiser`, the trajectories of `tools/localize.py` and
+world of the data that the scene was made of. `mambaloc.runtime.Localiser`, the trajectories of `mambaloc localize` and
 the page in the browser do so already.
 
 """

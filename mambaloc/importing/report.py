@@ -79,7 +79,7 @@ def print_summary(imported: Imported, folder: Path) -> None:
         return
     console.print(_proposals(imported))
     console.print(f"chosen: {imported.chosen.proposal.kind}, {imported.chosen.why}", soft_wrap=True)
-    training = f"python tools/train.py recipes/my_scene.yaml --data.scene {folder}"
+    training = f"mambaloc train my_scene --data.scene {folder}"
     console.print(
         f"wrote {folder}: {REPORT_FILE}, {PLOT_FILE}, {AGREEMENT_FILE}; next: {training}", soft_wrap=True, markup=False
     )

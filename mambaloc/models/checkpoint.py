@@ -70,7 +70,7 @@ class Checkpoint:
         for name in _FORMER_AUGMENTATION:
             arguments.pop(name, None)
         if not arguments:
-            raise InputError(f"{self.path}: holds no data settings; train it with tools/train.py")
+            raise InputError(f"{self.path}: holds no data settings; train it with mambaloc train")
         return PoseDataModule(**{**arguments, **changed})
 
     @property

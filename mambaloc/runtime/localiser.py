@@ -27,8 +27,8 @@ class Localiser:
     from being used, such as a damaged file or a picture whose camera is unknown, is a warning, and the network answers.
 
     Args:
-        model: an ``.onnx`` or ``.ort`` file that ``tools/export.py`` wrote; a bundle's folder; or a ``.safetensors``
-            file that ``tools/map.py`` wrote, to localise in the map alone.
+        model: an ``.onnx`` or ``.ort`` file that ``mambaloc export`` wrote; a bundle's folder; or a ``.safetensors``
+            file that ``mambaloc map`` wrote, to localise in the map alone.
         threads: that the network may use for one image; ONNX Runtime's choice unless given.
         sparse_map: the map to use beside a network, or its file. True takes the bundle's own, if it has one; False
             leaves it out.
@@ -148,7 +148,7 @@ def _model_file(path: Path) -> Path:
         return path
     found = [path / name for name in MODEL_FILES.values() if (path / name).is_file()]
     if not found:
-        raise InputError(f"{path}: holds none of {', '.join(MODEL_FILES.values())}; give a bundle of tools/export.py")
+        raise InputError(f"{path}: holds none of {', '.join(MODEL_FILES.values())}; give a bundle of mambaloc export")
     return found[0]
 
 

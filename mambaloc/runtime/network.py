@@ -20,7 +20,7 @@ class Network:
     """A network on ONNX Runtime.
 
     Args:
-        path: an ``.onnx`` or ``.ort`` file that ``tools/export.py`` wrote.
+        path: an ``.onnx`` or ``.ort`` file that ``mambaloc export`` wrote.
         threads: that one image may use; ONNX Runtime's choice unless given.
 
     Raises:
@@ -29,7 +29,7 @@ class Network:
 
     def __init__(self, path: Path, threads: int | None = None) -> None:
         if not path.is_file():
-            raise InputError(f"{path}: no such model; tools/export.py writes them")
+            raise InputError(f"{path}: no such model; mambaloc export writes them")
         self.path = path
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
@@ -41,7 +41,7 @@ class Network:
             raise InputError(f"{self.path}: ONNX Runtime cannot load it ({reason}); export it anew") from None
         metadata = self._session.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
-            raise InputError(f"{self.path}: carries no contract of its input; export it with tools/export.py")
+            raise InputError(f"{self.path}: carries no contract of its input; export it with mambaloc export")
         self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
         self._check_input()
 

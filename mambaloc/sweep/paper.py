@@ -115,7 +115,7 @@ def _table(name: str, told: dict[str, Any], by_basis: dict[Basis, list[StoredTri
     if any("±" in cell for line in lines for cell in line):
         notes.append("±: standard deviation over seeds.")
     if any(column.get("what") == "mib" for column in columns):
-        notes.append("Sizes of ours count what the published models carry too; tools/benchmark.py sizes tells both.")
+        notes.append("Sizes of ours count what the published models carry too; mambaloc benchmark sizes tells both.")
     return PaperTable(name, told["title"], lines, notes + told["footnotes"], len(lines) > 1 + len(told["rows"]))
 
 

@@ -136,7 +136,7 @@ def _result(measured: dict[str, Any]) -> Result:
     data, metrics, training = measured["data"], measured["metrics"], measured["training"]
     commit, clock = measured["evaluation"]["commit"], training["wall_clock"]
     if commit is None or clock is None:
-        raise InputError("no result without provenance: publish from a checkout, and a training of tools/train.py")
+        raise InputError("no result without provenance: publish from a checkout, and a training of mambaloc train")
     return Result(
         data=f"{data['dataset']}/{data['scene']}",
         official_split=bool(data["official_split"]),

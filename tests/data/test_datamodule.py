@@ -311,9 +311,9 @@ def test_a_crop_that_can_fit_no_image_is_refused_before_reading(make):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"scene": "heads"}, "python tools/download.py 7scenes heads --root"),
+        ({"scene": "heads"}, "mambaloc download 7scenes heads --root"),
         ({"scene": "haeds"}, "did you mean heads?"),
-        ({"dataset": "cambridge", "scene": "ShopFacade"}, "python tools/download.py cambridge ShopFacade --root"),
+        ({"dataset": "cambridge", "scene": "ShopFacade"}, "mambaloc download cambridge ShopFacade --root"),
         ({"dataset": "8scenes"}, "data.dataset '8scenes': there is none; choose one of 7scenes, cambridge, embedded"),
         ({"val_sequences": ["seq-09"]}, "data.val_sequences: no seq-09 in the training split"),
         ({"keep_count": 21}, "data.keep_count 21: there are 20 training frames"),

@@ -56,7 +56,7 @@ def test_misplaced_recipe_is_refused(words, rule, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--data.scene", "fire"], ["fire", "tools/download.py 7scenes fire"]),
+        (["--data.scene", "fire"], ["fire", "mambaloc download 7scenes fire"]),
         (["--model.gis", "both"], ["gis"]),
         (["--model", "LitMambaLok"], ["LitMambaLok", "LitMambaLoc"]),
         (["--model.learning_rate", "1"], ["learning_rate"]),

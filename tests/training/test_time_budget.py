@@ -1,5 +1,6 @@
 """Training for so many minutes, and the bundle that it ends with."""
 
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -57,7 +58,7 @@ def test_the_time_before_the_first_step_and_the_reserve_are_part_of_the_budget(c
 
 
 def test_a_budget_ends_a_run_that_has_no_other_end(tiny_recipe, tmp_path):
-    options = ["--trainer.max_epochs", "-1", "--time_budget.minutes", "0.2", "--time_budget.reserve_s", "1"]
+    options = ["--trainer.max_epochs", "-1", "--time_budget.minutes", "0.25", "--time_budget.reserve_s", "1"]
     main([str(tiny_recipe), *options, "--trainer.default_root_dir", str(tmp_path / "run")])
     assert read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")["global_step"] > 5
     assert (tmp_path / "run/evaluation/last/metrics.json").is_file()
@@ -69,6 +70,13 @@ def test_a_budget_that_is_used_up_before_the_first_step(clock):
         budget.on_train_start(SimpleNamespace(fast_dev_run=0), SimpleNamespace())
     with pytest.raises(InputError, match=r"time_budget\.minutes 0.2: must be more than the 30 s of"):
         TimeBudget(minutes=0.2)
+
+
+def test_a_budget_counts_from_the_start_of_the_command(tiny_recipe, tmp_path, capsys):
+    options = ["--time_budget.minutes", "1", "--trainer.default_root_dir", str(tmp_path / "run")]
+    with pytest.raises(SystemExit, match="2"):
+        main([str(tiny_recipe), *options], began_s=time.monotonic() - 61)
+    assert "s went by before the first step. Give more" in capsys.readouterr().err
 
 
 def test_the_progress_bar_shows_the_seconds_left():

@@ -1,4 +1,4 @@
-"""Imported scenes: anyone's capture as ``tools/import_scene.py`` writes it.
+"""Imported scenes: anyone's capture as ``mambaloc import`` writes it.
 
 ``SCENE/frames.csv`` has a row a frame, in the order of :data:`COLUMNS`: an image's path in the folder, the camera's
 ``world_from_cam``, the split that it is in. ``SCENE/scene.json`` tells of cameras, units and what was decided.
@@ -24,7 +24,7 @@ from mambaloc.runtime.world import World
 from mambaloc.text import open_text
 
 CAPTURE = "capture"
-"""Name of the dataset whose scenes ``tools/import_scene.py`` made, each named by its folder's path."""
+"""Name of the dataset whose scenes ``mambaloc import`` made, each named by its folder's path."""
 
 SCENE_FILE, FRAMES_FILE = "scene.json", "frames.csv"
 VERSION_KEY, VERSION = "mambaloc_scene", 1
@@ -96,7 +96,7 @@ def read_scene(folder: Path) -> dict[str, Any]:
     path = folder / SCENE_FILE
     told = read_json(path, _MEND, _MEND)
     if not isinstance(told, dict) or VERSION_KEY not in told:
-        raise InputError(f"{path}: is not of an imported scene; make one with tools/import_scene.py")
+        raise InputError(f"{path}: is not of an imported scene; make one with mambaloc import")
     if told[VERSION_KEY] != VERSION:
         raise InputError(f"{path}: is of version {str(told[VERSION_KEY])[:20]}, this reads {VERSION}; {_MEND}")
     return told

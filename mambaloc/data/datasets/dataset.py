@@ -73,7 +73,7 @@ class Source:
         elsewhere = "" if root == self.default_root else f" --root {root}"
         return (
             f"{scene} is not in {root}; {self.title} is at {self.page} ({self.terms}); "
-            f"get it with: python tools/download.py {self.name} {scene}{elsewhere}"
+            f"get it with: mambaloc download {self.name} {scene}{elsewhere}"
         )
 
 

@@ -74,7 +74,7 @@ def how_to_get(dataset: str, scene: str, root: Path) -> str:
     if path is None:
         return find_source(dataset).how_to_get(scene, root)
     source, out = (path, Path("scenes", path.name)) if path.is_dir() else ("CAPTURE", path)
-    return f"{path}: is no imported scene; make one with: python tools/import_scene.py {source} --out {out}"
+    return f"{path}: is no imported scene; make one with: mambaloc import {source} --out {out}"
 
 
 def is_rendered(folder: Path) -> bool:

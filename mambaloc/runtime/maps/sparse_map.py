@@ -146,7 +146,7 @@ class SparseMap:
             if about["version"] <= VERSION:
                 return cls._checked(about, {"first_drift": np.zeros((0, 6)), **arrays})
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error}). tools/map.py writes maps.") from None
+            raise InputError(f"{path}: cannot be read ({error.strerror or error}). mambaloc map writes maps.") from None
         except (*_DAMAGE, InputError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"{path}: is damaged or not a map ({reason}). Build the map again.") from None

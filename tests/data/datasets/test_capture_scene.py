@@ -205,8 +205,8 @@ def test_what_is_no_scene_says_how_to_make_one(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "raw").mkdir()
     for name, message in {
-        "scenes/dan": "scenes/dan: is no imported scene; make one with: python tools/import_scene.py CAPTURE --out",
-        "./raw": "raw: is no imported scene; make one with: python tools/import_scene.py raw --out scenes/raw",
+        "scenes/dan": "scenes/dan: is no imported scene; make one with: mambaloc import CAPTURE --out",
+        "./raw": "raw: is no imported scene; make one with: mambaloc import raw --out scenes/raw",
     }.items():
         with pytest.raises(InputError, match=re.escape(message)):
             scene_folder(*[None if part is None else part for part in locate("7scenes", None, name)])

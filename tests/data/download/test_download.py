@@ -457,9 +457,9 @@ def test_unknown_names_are_told_the_nearest(call: Callable[[], object], message:
 def test_how_to_get_is_one_line_with_the_command() -> None:
     assert how_to_get("7scenes", "heads", Path("data/7scenes")) == (
         f"heads is not in data/7scenes; 7-Scenes is at {SEVENSCENES.page} (non-commercial research); "
-        "get it with: python tools/download.py 7scenes heads"
+        "get it with: mambaloc download 7scenes heads"
     )
-    assert how_to_get("cambridge", "Street", Path("/big")).endswith("download.py cambridge Street --root /big")
+    assert how_to_get("cambridge", "Street", Path("/big")).endswith("mambaloc download cambridge Street --root /big")
     assert how_to_get("7scenes", "chees", Path("d")).endswith("nor a scene of 7-Scenes: did you mean chess?")
 
 

@@ -1,0 +1,40 @@
+"""The command ``mambaloc``, one file for each of its subcommands; ``tools/`` has a script for each, too."""
+
+from __future__ import annotations
+
+import sys
+from difflib import get_close_matches
+from importlib import import_module
+
+_MODULES = {
+    "train": ("train", "train a recipe"),
+    "evaluate": ("evaluate", "measure a checkpoint on test frames"),
+    "import": ("import_scene", "make a scene of a capture"),
+    "map": ("map", "build a sparse map, or change one"),
+    "localize": ("localize", "localise pictures, a film or a camera"),
+    "export": ("export", "write a bundle for apps"),
+    "verify": ("verify_bundle", "replay a bundle's frames through its models"),
+    "demo": ("demo", "localise in a browser"),
+    "visualize": ("visualize", "draw figures of a trained system"),
+    "download": ("download", "get a public dataset from its official address"),
+    "render": ("render_scene", "render a scene"),
+    "sweep": ("sweep", "train many recipes, and report"),
+    "benchmark": ("benchmark", "measure speed, latency and size"),
+    "publish": ("publish", "release a model"),
+}
+_USAGE = "usage: mambaloc COMMAND [...]\n\n{}\n\nmambaloc COMMAND --help lists a command's options."
+
+
+def main() -> None:
+    """Run the subcommand that the command line names. Nothing heavy is imported before it is known."""
+    name, words = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
+    if name in ("-h", "--help"):
+        print(_USAGE.format("\n".join(f"  {each:<10} {does}" for each, (_, does) in _MODULES.items())))
+        return
+    if name not in _MODULES:
+        near = get_close_matches(name, _MODULES, n=1)
+        hint = f"Did you mean {near[0]}?" if near else f"Choose one of {', '.join(_MODULES)}."
+        print(f"error: mambaloc {name}: there is no such command. {hint}", file=sys.stderr)
+        raise SystemExit(2)
+    sys.argv = [f"mambaloc {name}", *words]
+    import_module(f"{__name__}.{_MODULES[name][0]}").main()

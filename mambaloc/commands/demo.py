@@ -1,0 +1,31 @@
+"""Localise in a browser: mambaloc demo [BUNDLE] [--port 8000] [--lan] [--film VIDEO] [--out FOLDER]."""
+
+from pathlib import Path
+
+from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.demo import build_site, embedded_film, serve_page
+
+
+@exits_cleanly
+def main() -> None:
+    """Serve the page until Ctrl-C, or write it."""
+    quieten()
+    parser = OptionParser(description=__doc__)
+    parser.add_argument("bundle", nargs="?", type=Path, help="of mambaloc export; the embedded room's by default")
+    parser.add_argument("--port", type=whole_number(0, 65535), default=8000, help="0 takes a free one")
+    parser.add_argument("--lan", action="store_true", help="serve the local network by HTTPS, for a phone's camera")
+    parser.add_argument("--film", type=Path, help="video for the page to play")
+    parser.add_argument("--out", type=Path, help="write the page there, for any web server, and end")
+    args = parser.parse_args()
+    bundle = args.bundle or _released_bundle()
+    film = args.film or (None if args.bundle else embedded_film())
+    if args.out:
+        print(f"wrote {build_site(bundle, args.out, film)}")
+    else:
+        serve_page(bundle, film, args.port, args.lan)
+
+
+def _released_bundle() -> Path:
+    from mambaloc.zoo.bundles import released_bundle  # needs torch, which a bundle that is there does not
+
+    return released_bundle()

@@ -1,0 +1,39 @@
+"""Make a scene of any capture: mambaloc import SOURCE --out SCENE [--format KIND]."""
+
+import shlex
+import sys
+from pathlib import Path
+
+from mambaloc.console import OptionParser, exits_cleanly
+from mambaloc.errors import InputError
+from mambaloc.importing.importer import import_scene
+from mambaloc.importing.registry import FORMATS
+from mambaloc.importing.report import print_summary
+from mambaloc.importing.splits.selection import ASKED
+
+
+@exits_cleanly
+def main() -> None:
+    """Import, and say what was found."""
+    parser = OptionParser(
+        description=__doc__, epilog="; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
+    )
+    parser.add_argument("source", type=Path, help="the capture: a folder, or the file that lists its poses")
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the folder to make")
+    parser.add_argument("--format", metavar="KIND", help=f"of {', '.join(FORMATS)}; found out unless given")
+    parser.add_argument(
+        "--images", type=Path, metavar="FOLDER", help="the capture's pictures, where they lie elsewhere"
+    )
+    parser.add_argument("--metres-per-unit", type=float, metavar="X", help="the capture's unit, where it is known")
+    parser.add_argument(
+        "--split", default="auto", choices=ASKED, help="what to test on; the measured best unless given"
+    )
+    parser.add_argument("--adjust-poses", action="store_true", help="also write poses that fit the pictures better")
+    args = parser.parse_args()
+    command = shlex.join(["python", *sys.argv])
+    imported = import_scene(
+        args.source, args.out, args.format, args.metres_per_unit, args.split, command, args.adjust_poses, args.images
+    )
+    print_summary(imported, args.out)
+    if not imported.verdict.is_usable:
+        raise InputError(f"{args.out}: {imported.verdict}; see report.md there, and mend the capture")

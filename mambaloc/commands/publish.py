@@ -1,0 +1,19 @@
+"""Release a model: mambaloc publish CHECKPOINT --tag TAG [--zoo zoo]."""
+
+from pathlib import Path
+
+from mambaloc.console import OptionParser, exits_cleanly, quieten
+from mambaloc.zoo.publishing import publish
+
+
+@exits_cleanly
+def main() -> None:
+    """Measure, write, read back, measure again."""
+    quieten()
+    parser = OptionParser(description=__doc__)
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--tag", required=True, help="of its name, ARCH.TAG")
+    parser.add_argument("--zoo", type=Path, default=Path("zoo"), help="folder of released models")
+    args = parser.parse_args()
+    folder = publish(args.checkpoint, args.tag, args.zoo)
+    print(f"{folder}: {', '.join(sorted(file.name for file in folder.iterdir()))}")

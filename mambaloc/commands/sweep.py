@@ -1,0 +1,48 @@
+"""Train many recipes and report: mambaloc sweep run SWEEP.yaml, mambaloc sweep report RESULTS."""
+
+import argparse
+from pathlib import Path
+
+from mambaloc.console import OptionParser, exits_cleanly, quieten
+from mambaloc.sweep import Store, print_plan, read_sweep, run_sweep
+
+
+@exits_cleanly
+def main() -> None:
+    """Run trials, or report what ended."""
+    quieten()
+    parser = OptionParser(description=__doc__)
+    parts = parser.add_subparsers(required=True)
+    part = parts.add_parser("run", help="train and evaluate every trial of a sweep that has not ended before")
+    part.add_argument("sweep", type=Path, help="a file like those in recipes/sweeps/")
+    part.add_argument("--out", type=Path, help="folder of results.sqlite and runs/; runs/sweeps/NAME unless given")
+    part.add_argument("--address", help="of a Ray cluster, whose machines all see --out")
+    part.add_argument("--retry-failed", action="store_true", help="run trials again that failed")
+    part.add_argument("--dry-run", action="store_true", help="list the trials and what they may take")
+    part.set_defaults(call=_run)
+    part = parts.add_parser("report", help="write a sweep's results beside the paper's tables")
+    part.add_argument("results", type=Path, help="the folder that run wrote to")
+    part.add_argument("--compare", nargs=3, action="append", default=[], metavar=("AXIS", "BEFORE", "AFTER"))
+    part.add_argument("--epoch", default="last", choices=("last", "best"))
+    part.add_argument("--reach", type=float, metavar="METRES", help="position error to report the training seconds to")
+    part.add_argument("--out", type=Path, help="folder to write; RESULTS/report unless given")
+    part.set_defaults(call=_report)
+    args = parser.parse_args()
+    args.call(args)
+
+
+def _run(args: argparse.Namespace) -> None:
+    sweep, out = read_sweep(args.sweep), args.out or Path("runs/sweeps", args.sweep.stem)
+    if args.dry_run:
+        print_plan(sweep, Store.ended(out))
+        return
+    ended = run_sweep(sweep, out, args.address, args.retry_failed)
+    print(f"{out}: {ended['done']} trials done, {ended['failed']} failed, {ended['found']} of them from before")
+
+
+def _report(args: argparse.Namespace) -> None:
+    from mambaloc.sweep.report import write_report  # needs torch, which running does not
+
+    out = args.out or args.results / "report"
+    rows, failed = write_report(args.results, out, args.compare, args.epoch, args.reach)
+    print(f"{out}: report.html, report.md, tables/, plots/; {len(rows)} rows, {len(failed)} trials failed")

@@ -1,0 +1,45 @@
+"""Recipes by name: those of a checkout's ``recipes/``, which an installation has, too."""
+
+from __future__ import annotations
+
+import sys
+from difflib import get_close_matches
+from pathlib import Path
+
+from mambaloc.errors import InputError
+
+_FOLDERS = (Path(__file__).parents[1] / "recipes", Path(sys.prefix) / "share/mambaloc/recipes")
+"""A checkout's, and an installation's."""
+
+
+def list_recipes() -> list[str]:
+    """Names of the recipes that come with the package, such as ``quickstart`` and ``overlays/gis``, sorted."""
+    return sorted(
+        {
+            path.relative_to(folder).with_suffix("").as_posix()
+            for folder in _FOLDERS
+            for pattern in ("*.yaml", "overlays/*.yaml")
+            for path in folder.glob(pattern)
+        }
+    )
+
+
+def recipe_path(recipe: str) -> Path:
+    """Find a recipe.
+
+    Args:
+        recipe: path of a YAML file; or the name of one that comes with the package, such as ``quickstart`` or
+            ``recipes/quickstart.yaml``.
+
+    Raises:
+        InputError: where there is none.
+    """
+    path = Path(recipe)
+    if path.is_file():
+        return path
+    name = path.with_suffix("").as_posix().removeprefix("recipes/")
+    if name in list_recipes():
+        return next(found for folder in _FOLDERS if (found := folder / f"{name}.yaml").is_file())
+    near = get_close_matches(name, list_recipes(), n=1)
+    hint = f"Did you mean {near[0]}?" if near else f"Give a YAML file, or one of {', '.join(list_recipes())}."
+    raise InputError(f"{recipe}: there is no such recipe. {hint}")
