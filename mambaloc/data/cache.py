@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +26,11 @@ from mambaloc.errors import InputError
 from mambaloc.exif import unclear_pose
 from mambaloc.files import claim_space
 from mambaloc.images import center_cropped, decode_image, resized
+from mambaloc.memory import release_pages
 from mambaloc.user_cache import default_cache_dir, fingerprint
 
 _VERSION = 2
+_AT_ONCE = 128  # frames that are decoded ahead, and mapped
 
 Shape = tuple[int, ...]
 
@@ -125,29 +127,35 @@ def _fill(
     rows: list[int] = []
     sizes: list[Shape] = []
     bad: list[tuple[int, str]] = []
-    with ThreadPoolExecutor() as pool:
-        decoded = pool.map(lambda path: _decode(path, short_side), paths)
-        for row, frame in enumerate(_with_progress(decoded, len(paths))):
-            if isinstance(frame, str):
-                bad.append((row, frame))
-                continue
-            if images is None:
-                held = held or frame.shape
-                images = np.lib.format.open_memmap(file, mode="w+", dtype=np.uint8, shape=(len(paths), *held))
-                claim_space(file)
-            common = tuple(map(min, frame.shape, images.shape[1:]))
-            if frame.shape != images.shape[1:] and (least is None or common[1] < least[0] or common[2] < least[1]):
-                bad.append((row, f"image is {_size(frame)} after resizing, where the first is {_size(images[0])}"))
-                continue
-            if common != images.shape[1:]:
-                pool.shutdown(cancel_futures=True)
-                return None, common
-            images[len(rows)] = center_cropped(frame.transpose(1, 2, 0), common[1:]).transpose(2, 0, 1)
-            rows.append(row)
-            sizes.append(frame.shape[1:])
+    for row, frame in enumerate(_with_progress(_decoded(paths, short_side), len(paths))):
+        if isinstance(frame, str):
+            bad.append((row, frame))
+            continue
+        if images is None:
+            held = held or frame.shape
+            images = np.lib.format.open_memmap(file, mode="w+", dtype=np.uint8, shape=(len(paths), *held))
+            claim_space(file)
+        common = tuple(map(min, frame.shape, images.shape[1:]))
+        if frame.shape != images.shape[1:] and (least is None or common[1] < least[0] or common[2] < least[1]):
+            bad.append((row, f"image is {_size(frame)} after resizing, where the first is {_size(images[0])}"))
+            continue
+        if common != images.shape[1:]:
+            return None, common
+        images[len(rows)] = center_cropped(frame.transpose(1, 2, 0), common[1:]).transpose(2, 0, 1)
+        rows.append(row)
+        sizes.append(frame.shape[1:])
+        if len(rows) % _AT_ONCE == 0:
+            release_pages(images)
     if images is not None:
         images.flush()
     return {"rows": rows, "bad": bad, "sizes": sizes}, held
+
+
+def _decoded(paths: Sequence[Path], short_side: int) -> Iterator[NDArray[np.uint8] | str]:
+    """Decode images in order, a few ahead: whoever takes them may be slower than all cores together."""
+    with ThreadPoolExecutor() as pool:
+        for start in range(0, len(paths), _AT_ONCE):
+            yield from pool.map(lambda path: _decode(path, short_side), paths[start : start + _AT_ONCE])
 
 
 def _decode(path: Path, short_side: int) -> NDArray[np.uint8] | str:

@@ -22,6 +22,7 @@ from mambaloc.data.points import ScenePoints
 from mambaloc.errors import InputError
 from mambaloc.geometry import cropped_intrinsics, resized_intrinsics
 from mambaloc.images import center_corner, resized_size
+from mambaloc.memory import release_pages
 from mambaloc.types import PoseBatch
 
 
@@ -64,7 +65,9 @@ class CachedFrames(Dataset[PoseBatch]):
 
     def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Decoded pictures of some rows, (B, 3, H, W)."""
-        return np.stack([self.images[row] for row in rows])
+        pictures = np.stack([self.images[row] for row in rows])
+        release_pages(self.images)
+        return pictures
 
     def to(self, device: torch.device) -> Self:
         """Return the same frames, whole in a device's memory: batches are made there, and nothing is copied to it."""

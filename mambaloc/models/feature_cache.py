@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mambaloc.errors import InputError
 from mambaloc.files import claim_space
+from mambaloc.memory import release_pages
 from mambaloc.nn import SplitBackbone
 from mambaloc.types import PoseBatch
 from mambaloc.user_cache import made_once
@@ -106,6 +107,7 @@ class FeatureCache:
             new = torch.cat([each.flatten(1) for each in self.compute(image)], dim=1).half().cpu().numpy()
             found[~is_kept] = new
             self._keep(places[~is_kept], new)
+        release_pages(self.features)
         flat = torch.from_numpy(found).to(batch.image.device).float()
         parts = zip(flat.split(self._sizes, dim=1), self.shapes, strict=True)
         return [part.unflatten(1, shape) for part, shape in parts]

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.memory import release_pages
 from mambaloc.runtime.maps.viewpoints import farthest_points
 from mambaloc.synthesis.consistency import confirmed
 from mambaloc.synthesis.plane_sweep import PlaneSweep, SweepSettings
@@ -20,6 +21,7 @@ _MARGIN = 1.3
 _TRIAL_FRAMES, _TRIAL_OTHERS = 6, 1
 _TRIAL_RANGE = (0.2, 40.0)  # of how far the cameras are spread
 _LEAST_KNOWN = 0.05
+_AT_ONCE = 128  # pictures that are mapped
 
 
 def depth_from_pictures(
@@ -69,12 +71,14 @@ def searched(images: NDArray[np.uint8], intrinsics: Floats) -> tuple[NDArray[np.
     if part == 1:
         return images, intrinsics
     size = (width // part, height // part)
-    small = [
-        cv2.resize(each.transpose(1, 2, 0), size, interpolation=cv2.INTER_AREA).transpose(2, 0, 1) for each in images
-    ]
+    small = np.empty((len(images), 3, *size[::-1]), np.uint8)
+    for row, each in enumerate(images):
+        small[row] = cv2.resize(each.transpose(1, 2, 0), size, interpolation=cv2.INTER_AREA).transpose(2, 0, 1)
+        if row % _AT_ONCE == 0:
+            release_pages(images)
     scale = np.diag((size[0] / width, size[1] / height, 1.0))
     scale[:2, 2] = (scale[[0, 1], [0, 1]] - 1) / 2  # pixel centres
-    return np.stack(small), scale @ intrinsics
+    return small, scale @ intrinsics
 
 
 def enlarged(depth_m: NDArray[np.float32], size: tuple[int, ...]) -> NDArray[np.float32]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mambaloc.console import progress
 from mambaloc.errors import InputError
 from mambaloc.files import whole_folder
+from mambaloc.memory import release_pages
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 from mambaloc.synthesis.sampling import PoseSampler, Spread
 from mambaloc.synthesis.splatting import Splatter
@@ -170,6 +171,7 @@ def _join(parts: list[Path], count: int, folder: Path) -> None:
             )
             for start, part in zip(range(0, count, PART), parts, strict=True):
                 joined[start : start + PART] = np.load(part / f"{name}.npy", mmap_mode="r")[: count - start]
+                release_pages(joined)
             joined.flush()
     for part in parts:
         shutil.rmtree(part)

@@ -15,6 +15,7 @@ from torch.utils.data import DistributedSampler
 from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.points import ScenePoints
 from mambaloc.errors import InputError
+from mambaloc.memory import release_pages
 from mambaloc.runtime.rotations import quaternion_from_matrix
 from mambaloc.synthesis import Views
 from mambaloc.types import PoseBatch
@@ -50,7 +51,10 @@ class FramesAndViews(CachedFrames):
     def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Pictures of some rows, frames' and views', (B, 3, H, W)."""
         count = len(self.frames)
-        return np.stack([self.images[row] if row < count else self.views.images[row - count] for row in rows])
+        pictures = np.stack([self.images[row] if row < count else self.views.images[row - count] for row in rows])
+        release_pages(self.images)
+        release_pages(self.views.images)
+        return pictures
 
     def to(self, device: torch.device) -> Self:
         """Return the same frames and views, whole in a device's memory."""
@@ -64,6 +68,7 @@ class FramesAndViews(CachedFrames):
         for place, row in enumerate(rows):
             if (view := row - len(self.frames)) >= 0:
                 np.isnan(self.views.depth_m[view], out=holes[place])
+        release_pages(self.views.depth_m)
         return holes
 
     def __getitems__(self, items: list[int]) -> PoseBatch:

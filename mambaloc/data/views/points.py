@@ -7,6 +7,7 @@ import numpy as np
 from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.points.scene_points import Points, ScenePoints, frame_rng, stacked
 from mambaloc.geometry import resized_intrinsics
+from mambaloc.memory import release_pages
 from mambaloc.synthesis import Splatter, Views
 from mambaloc.synthesis.posed_depth import Floats
 
@@ -16,18 +17,12 @@ _AT_ONCE = 64  # frames
 
 def points_of_views(views: Views, count: int, seed: int) -> ScenePoints:
     """Draw pixels of each view and lift them by its depth into the world, at most ``count``."""
-    return ScenePoints(
-        stacked(
-            [
-                _lifted(depth_m, matrix, pose, count, np.random.default_rng((seed, row)))
-                for row, (depth_m, matrix, pose) in enumerate(
-                    zip(views.depth_m, views.intrinsics, views.world_from_cam, strict=True)
-                )
-            ],
-            count,
-        ),
-        "views",
-    )
+    points: list[Points] = []
+    for row, (matrix, pose) in enumerate(zip(views.intrinsics, views.world_from_cam, strict=True)):
+        points.append(_lifted(views.depth_m[row], matrix, pose, count, np.random.default_rng((seed, row))))
+        if row % _AT_ONCE == 0:
+            release_pages(views.depth_m)
+    return ScenePoints(stacked(points, count), "views")
 
 
 def points_of_frames_by_depth(
