@@ -19,8 +19,8 @@ from mambaloc.user_cache import made_once
 from mambaloc.zoo.loading import is_checkpoint, load, released_folder, released_map
 from mambaloc.zoo.manifest import MANIFEST_FILE, Manifest
 
-EMBEDDED = "student.embedded_room"
-"""The released model that comes with the package."""
+EMBEDDED = "denseloc.embedded_room"
+"""The released model that answers where none is named."""
 
 _EMBEDDED_SCENE = "embedded/room"
 _EMBEDDED_MAP = MapSettings(key_frames=80, width=160)

@@ -62,8 +62,8 @@ def released_folder(source: str) -> Path:
     for zoo in _ZOOS:
         if re.fullmatch(r"[a-z0-9_]+\.[a-z0-9_]+", source) and (zoo / source / MANIFEST_FILE).is_file():
             return zoo / source
-    near = get_close_matches(source, list_released(), n=3)
-    raise InputError(f"{source}: no such model; " + (f"did you mean {', '.join(near)}?" if near else _SOURCES))
+    near = get_close_matches(source, list_released(), n=1)
+    raise InputError(f"{source}: no such model; " + (f"did you mean {near[0]}?" if near else _SOURCES))
 
 
 def load_released(folder: Path) -> LitPoseRegressor:

@@ -13,17 +13,22 @@ from mambaloc.zoo import Manifest, list_released
 ZOO = Path(__file__).parents[2] / "zoo"
 
 
-def test_it_is_small_and_in_the_wheel():
-    shipped = [path for path in ZOO.iterdir() if path.is_dir()]
-    assert [path.name for path in shipped] == ["student.embedded_room"]
-    assert {path.name for path in shipped} <= set(list_released())
-    assert sum(file.stat().st_size for file in shipped[0].iterdir()) < 8e6
-    assert f'"zoo/{shipped[0].name}/*"' in (ZOO.parent / "pyproject.toml").read_text()
+NAMES = ["denseloc.embedded_room", "student.embedded_room"]
+
+
+def test_they_are_small_and_in_the_wheel():
+    shipped = sorted(path for path in ZOO.iterdir() if path.is_dir())
+    assert [path.name for path in shipped] == NAMES
+    assert set(NAMES) <= set(list_released())
+    for folder in shipped:
+        assert sum(file.stat().st_size for file in folder.iterdir()) < 8e6
+        assert f'"zoo/{folder.name}/*"' in (ZOO.parent / "pyproject.toml").read_text()
 
 
 @pytest.mark.slow
-def test_its_figures_are_found_again():
-    system, manifest = mambaloc.load("student.embedded_room"), Manifest.read(ZOO / "student.embedded_room")
+@pytest.mark.parametrize("name", NAMES)
+def test_their_figures_are_found_again(name):
+    system, manifest = mambaloc.load(name), Manifest.read(ZOO / name)
     (result,) = manifest.results
     assert result.data == manifest.scene == "embedded/room"
     data = PoseDataModule("embedded", image_size=system.image_size, short_side=manifest.short_side)
