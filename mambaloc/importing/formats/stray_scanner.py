@@ -50,7 +50,7 @@ def read_stray_scanner(source: Path) -> Capture:
     table = _odometry(source / _ODOMETRY)
     numbers = [_frame_number(table, row) for row in range(len(table.lines))]
     quaternion = table.numbers[:, [8, 5, 6, 7]]
-    world_from_cam, _ = from_quaternions(table.numbers[:, 2:5], quaternion, table.where)
+    checked = from_quaternions(table.numbers[:, 2:5], quaternion, table.where)
     film = chosen_as_stored(source / _FILM)
     present = [row for row, number in enumerate(numbers) if number in film.images]
     if not present:
@@ -64,17 +64,27 @@ def read_stray_scanner(source: Path) -> Capture:
     names, cameras = told_apart([_camera(table, row, size, matrix, source) for row in present])
     depth = [source / "depth" / f"{numbers[row]:06d}.png" for row in present]
     posed = [
-        Posed(image, folder_name(source), world_from_cam[row], name, table.numbers[row, 0], depth=file)
-        for image, row, name, file in zip(
-            images, present, names, (f if f.is_file() else None for f in depth), strict=True
+        Posed(
+            image,
+            folder_name(source),
+            checked.poses[row],
+            name,
+            table.numbers[row, 0],
+            depth=file if file.is_file() else None,
+            fault=checked.faults.get(row, ""),
         )
+        for image, row, name, file in zip(images, present, names, depth, strict=True)
     ]
     return build_capture(
         "stray_scanner",
         source,
         posed,
         unit="metre",
-        choices={**_CHOICES, "frames": f"{len(film.images)} of {film.read}, by sharpness and movement"},
+        choices={
+            **_CHOICES,
+            **checked.choices,
+            "frames": f"{len(film.images)} of {film.read}, by sharpness and movement",
+        },
         cameras=cameras,
         missing=[f"{_FILM}, frame {number}" for number in numbers if number >= film.read],
         beside=film.images.values(),

@@ -30,9 +30,9 @@ def main(job: Mapping[str, Any]) -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     try:
         tell(step="Finding features")
-        _find_features(pycolmap, job)
+        find_features(pycolmap, job)
         tell(step="Matching frames")
-        _match_features(pycolmap, job)
+        match_features(pycolmap, job)
         tell(step="Placing frames", of=len(job["names"]))
         tell(placed=_place_images(pycolmap, job, tell))
     except (RuntimeError, ValueError) as error:  # what pycolmap makes of C++'s
@@ -52,7 +52,8 @@ def _speaker() -> Tell:
     return tell
 
 
-def _find_features(pycolmap: Any, job: Mapping[str, Any]) -> None:
+def find_features(pycolmap: Any, job: Mapping[str, Any]) -> None:
+    """Make the database, and fill it with the images' features."""
     mode = pycolmap.CameraMode.SINGLE if job["one_camera"] else pycolmap.CameraMode.PER_IMAGE
     options = pycolmap.FeatureExtractionOptions(num_threads=job["threads"], max_image_size=_LONGEST_PX, use_gpu=False)
     options.sift.max_num_features = _FEATURES
@@ -63,7 +64,8 @@ def _find_features(pycolmap: Any, job: Mapping[str, Any]) -> None:
     pycolmap.extract_features(job["database"], job["images"], job["names"], mode, extraction_options=options)
 
 
-def _match_features(pycolmap: Any, job: Mapping[str, Any]) -> None:
+def match_features(pycolmap: Any, job: Mapping[str, Any]) -> None:
+    """Match the features of neighbours, or of every pair, and keep what one geometry explains."""
     matching = pycolmap.FeatureMatchingOptions(num_threads=job["threads"], use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job["seed"]
