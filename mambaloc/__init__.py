@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mambaloc.data import PoseDataModule
     from mambaloc.models import create_model, list_models
     from mambaloc.models.mambaloc import LitMambaLoc
-    from mambaloc.zoo import load
+    from mambaloc.zoo import create_transform, list_released, load
 
 __version__ = version("mambaloc")
 
@@ -23,11 +23,26 @@ _EXPORTS = {
     "LitMambaLoc": "mambaloc.models.mambaloc",
     "PoseDataModule": "mambaloc.data",
     "create_model": "mambaloc.models",
+    "create_transform": "mambaloc.zoo",
     "list_models": "mambaloc.models",
+    "list_released": "mambaloc.zoo",
     "load": "mambaloc.zoo",
 }
 
-__all__ = ["LitMambaLoc", "PoseDataModule", "__version__", "create_model", "list_models", "load"]
+__all__ = [
+    "LitMambaLoc",
+    "PoseDataModule",
+    "__version__",
+    "create_model",
+    "create_transform",
+    "list_models",
+    "list_released",
+    "load",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def __getattr__(name: str) -> Any:

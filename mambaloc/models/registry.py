@@ -15,10 +15,17 @@ _System = TypeVar("_System", bound=type[LitPoseRegressor])
 
 
 def register_model(name: str) -> Callable[[_System], _System]:
-    """Class decorator that makes a system known by ``name``."""
+    """Class decorator that makes a system known by ``name``.
+
+    The same class again, as of a notebook's cell that is run twice, replaces the first.
+
+    Raises:
+        ValueError: where another class has the name.
+    """
 
     def register(cls: _System) -> _System:
-        if name in _MODELS:
+        known = _MODELS.get(name)
+        if known and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
             raise ValueError(f"model {name!r} is registered already, by {_MODELS[name].__qualname__}")
         cls.registry_name = name
         _MODELS[name] = cls

@@ -2,5 +2,6 @@
 
 from mambaloc.zoo.loading import list_released, load
 from mambaloc.zoo.manifest import Manifest, Result
+from mambaloc.zoo.transform import Transform, create_transform
 
-__all__ = ["Manifest", "Result", "list_released", "load"]
+__all__ = ["Manifest", "Result", "Transform", "create_transform", "list_released", "load"]

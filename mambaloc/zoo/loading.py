@@ -80,7 +80,8 @@ def load_released(folder: Path) -> LitPoseRegressor:
     except (SafetensorError, RuntimeError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[-1].strip()
         raise InputError(f"{path}: does not fit {manifest.model} as the manifest describes it ({reason})") from None
-    system.provenance = dict(manifest.trained)
+    trained_on = {"short_side": manifest.short_side, **manifest.trained.get("data", {})}
+    system.provenance = {**manifest.trained, "data": trained_on}
     return system.eval()
 
 

@@ -85,6 +85,14 @@ def test_a_name_is_taken_once():
     assert type(create_model("mean")) is LitMean
 
 
+def test_a_notebooks_cell_may_run_twice():
+    register_model("mean")(LitMean)
+    again = type("LitMean", (LitMean,), {"__module__": LitMean.__module__, "__qualname__": LitMean.__qualname__})
+    register_model("mean")(again)
+    assert type(create_model("mean")) is again
+    register_model("mean")(LitMean)
+
+
 def test_a_system_without_a_network_is_named():
     with pytest.raises(TypeError, match="LitEmpty"):
         type("LitEmpty", (LitPoseRegressor,), {})()

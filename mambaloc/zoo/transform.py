@@ -1,0 +1,60 @@
+"""From a picture to what a trained system takes, as in its training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mambaloc.errors import InputError
+from mambaloc.images import Image, as_rgb, center_cropped, read_image, resized
+from mambaloc.models import LitPoseRegressor
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Resize, crop the middle, and scale to 0..1, as test frames are.
+
+    Args:
+        short_side: pixels that the shorter side is resized to, averaging areas.
+        crop: (height, width) of what the network sees.
+    """
+
+    short_side: int
+    crop: tuple[int, int]
+
+    def __call__(self, image: str | Path | Image) -> Tensor:
+        """Picture to (3, H, W), float32 RGB.
+
+        Args:
+            image: a file, which is read upright; or ``uint8`` (H, W, 3) RGB, (H, W) grey or (H, W, 4).
+
+        Raises:
+            InputError: where it is no whole picture.
+        """
+        pixels = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
+        cropped = center_cropped(resized(pixels, self.short_side), self.crop)
+        return torch.from_numpy(np.ascontiguousarray(cropped.transpose(2, 0, 1))).float() / 255
+
+
+def create_transform(system: LitPoseRegressor) -> Transform:
+    """Make the transform of a trained system's pictures.
+
+    >>> system = mambaloc.load("denseloc.embedded_room")
+    >>> prediction = system(mambaloc.create_transform(system)("picture.png")[None])
+
+    Systems that use a camera's intrinsics then take those of their training camera.
+
+    Args:
+        system: as :func:`mambaloc.load` returns it.
+
+    Raises:
+        InputError: for a system that was not trained, which has no size for pictures yet.
+    """
+    short_side = system.provenance.get("data", {}).get("short_side")
+    if short_side is None:
+        raise InputError(f"{system.registry_name}: does not say what pictures it was trained on. Load a trained one.")
+    return Transform(short_side, system.image_size)
