@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,11 @@ from mambaloc.text import decode_text
 _MOST_VALUES = 10**6
 _MOST_JSON_BYTES = 2**30
 _LONGEST_PATH = 1024  # bytes; 255 for each part, as file systems have it
+
+
+def shipped_folders(name: str) -> tuple[Path, Path]:
+    """Where a folder of the project's top level may be: in a checkout, and in an installation."""
+    return Path(__file__).parents[1] / name, Path(sys.prefix) / "share/mambaloc" / name
 
 
 def sha256(path: Path) -> str:

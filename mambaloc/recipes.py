@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from difflib import get_close_matches
 from pathlib import Path
 
 from mambaloc.errors import InputError
+from mambaloc.files import shipped_folders
 
-_FOLDERS = (Path(__file__).parents[1] / "recipes", Path(sys.prefix) / "share/mambaloc/recipes")
-"""A checkout's, and an installation's."""
+_FOLDERS = shipped_folders("recipes")
 
 
 def list_recipes() -> list[str]:

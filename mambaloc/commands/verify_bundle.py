@@ -18,4 +18,4 @@ def main() -> None:
     deviations = verify_bundle(args.bundle, args.threads)
     print_deviations(deviations)
     if bad := [each.file for each in deviations if not each.within]:
-        raise InputError(f"{args.bundle}: {', '.join(bad)} deviates more than allowed; export the bundle anew")
+        raise InputError(f"{args.bundle}: {', '.join(bad)} deviates more than allowed; export the bundle again")

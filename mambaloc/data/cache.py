@@ -152,7 +152,7 @@ def _fill(
 
 
 def _decoded(paths: Sequence[Path], short_side: int) -> Iterator[NDArray[np.uint8] | str]:
-    """Decode images in order, a few ahead: whoever takes them may be slower than all cores together."""
+    """Decode images in order, a few ahead: the caller may be slower than all cores together."""
     with ThreadPoolExecutor() as pool:
         for start in range(0, len(paths), _AT_ONCE):
             yield from pool.map(lambda path: _decode(path, short_side), paths[start : start + _AT_ONCE])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import sys
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -13,12 +12,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load as tensors_of
 
 from mambaloc.errors import InputError
+from mambaloc.files import shipped_folders
 from mambaloc.models import Checkpoint, LitPoseRegressor, create_model
 from mambaloc.runtime.maps import MAP_FILE
 from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest
 
-_ZOOS = (Path(__file__).parents[2] / "zoo", Path(sys.prefix) / "share/mambaloc/zoo")
-"""A checkout's, and an installation's."""
+_ZOOS = shipped_folders("zoo")
 
 _SOURCES = "give a checkpoint, 'ARCH.TAG' (see list_released()), 'local-dir:FOLDER', or 'hf-hub:ORG/NAME@REVISION'"
 

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from mambaloc.errors import InputError
-from mambaloc.images import Image, as_rgb, center_cropped, read_image, resized
+from mambaloc.images import Image, as_rgb, read_image
 from mambaloc.models import LitPoseRegressor
+from mambaloc.runtime.contract import Preprocessing
 
 
 @dataclass(frozen=True)
@@ -19,12 +20,10 @@ class Transform:
     """Resize, crop the middle, and scale to 0..1, as test frames are.
 
     Args:
-        short_side: pixels that the shorter side is resized to, averaging areas.
-        crop: (height, width) of what the network sees.
+        preprocessing: the sizes, as exported models state them.
     """
 
-    short_side: int
-    crop: tuple[int, int]
+    preprocessing: Preprocessing
 
     def __call__(self, image: str | Path | Image) -> Tensor:
         """Picture to (3, H, W), float32 RGB.
@@ -36,7 +35,7 @@ class Transform:
             InputError: where it is no whole picture.
         """
         pixels = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
-        cropped = center_cropped(resized(pixels, self.short_side), self.crop)
+        cropped = self.preprocessing.apply(pixels)
         return torch.from_numpy(np.ascontiguousarray(cropped.transpose(2, 0, 1))).float() / 255
 
 
@@ -57,4 +56,4 @@ def create_transform(system: LitPoseRegressor) -> Transform:
     short_side = system.provenance.get("data", {}).get("short_side")
     if short_side is None:
         raise InputError(f"{system.registry_name}: does not say what pictures it was trained on. Load a trained one.")
-    return Transform(short_side, system.image_size)
+    return Transform(Preprocessing(short_side, system.image_size))

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.importing.film import write_frames
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.sfm.process import Job
@@ -53,7 +54,8 @@ def _measure(seed: int, count: int, work: Path) -> None:
     film, world_from_cam = _film(seed, count, work)
     images, database = work / "images", work / "database.db"
     images.mkdir()
-    names, taken_s = _timed(lambda: _write(film, images))
+    chosen, taken_s = _timed(lambda: write_frames(choose_frames(frames_of(film)[0]), images))
+    names = sorted(chosen[0])
     print(f"film {seed}: {len(names)} of {count} frames chosen, {taken_s:.2f} s")
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     job = asdict(Job(images, names, work, one_camera=True, neighbours=_NEIGHBOURS, threads=1, seed=0))
@@ -80,14 +82,6 @@ def _film(seed: int, count: int, folder: Path) -> tuple[Path, Floats]:
         writer.write(render(room, default_intrinsics(_SIZE), pose, _SIZE)[0][..., ::-1])
     writer.release()
     return path, world_from_cam
-
-
-def _write(film: Path, folder: Path) -> list[str]:
-    names = []
-    for frame in choose_frames(frames_of(film)[0]):
-        names.append(f"{int(frame.name):06d}.jpg")
-        cv2.imwrite(str(folder / names[-1]), frame.image[..., ::-1])
-    return names
 
 
 def _incremental(database: Path, images: Path, out: Path) -> Any:
