@@ -142,7 +142,7 @@ def _fitted(matches: Matches, pair: int) -> int:
     rows = slice(*np.searchsorted(matches.pair, (pair, pair + 1)))
     near = NEAR_PX / matches.focal_px[pair]
     first, second = matches.first[rows], matches.second[rows]
-    _, inliers = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, near, 300)
+    _, inliers = cv2.findEssentialMat(first, second, np.eye(3), cv2.USAC_DEFAULT, 0.999, near, 300)
     return 0 if inliers is None else int(np.count_nonzero(inliers))
 
 
