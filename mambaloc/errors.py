@@ -1,5 +1,10 @@
 """What is a user's to mend: errors, and warnings where the work can go on."""
 
+from collections.abc import Collection
+from difflib import get_close_matches
+
+_MOST_LISTED = 50
+
 
 class InputError(Exception):
     """A mistake in what the user gave: file, option or data.
@@ -11,3 +16,17 @@ class InputError(Exception):
 
 class InputWarning(UserWarning):
     """Something that the user gave cannot be used, and the work goes on without it; tools print it as one line."""
+
+
+def suggestion(name: str, known: Collection[str]) -> str:
+    """What to write in place of an unknown name: a question for the closest, or all names where none is close.
+
+    Of very many names none is listed.
+    """
+    by_lower = {each.lower(): each for each in known}
+    close = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
+    if close:
+        return f"Did you mean {by_lower[close[0]]}?"
+    if len(known) > _MOST_LISTED:
+        return f"None of {len(known)} names is close to it."
+    return f"Choose one of {', '.join(known)}."

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from pathlib import Path
 
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, suggestion
 from mambaloc.files import shipped_folders
 
 _FOLDERS = shipped_folders("recipes")
@@ -39,6 +38,4 @@ def recipe_path(recipe: str) -> Path:
     name = path.with_suffix("").as_posix().removeprefix("recipes/")
     if name in list_recipes():
         return next(found for folder in _FOLDERS if (found := folder / f"{name}.yaml").is_file())
-    near = get_close_matches(name, list_recipes(), n=1)
-    hint = f"Did you mean {near[0]}?" if near else f"Give a YAML file, or one of {', '.join(list_recipes())}."
-    raise InputError(f"{recipe}: there is no such recipe. {hint}")
+    raise InputError(f"{recipe}: there is no such recipe. {suggestion(name, list_recipes())}")

@@ -6,12 +6,11 @@ import re
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from difflib import get_close_matches
 from typing import NoReturn
 
 from lightning.pytorch.cli import LightningArgumentParser
 
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, suggestion
 from mambaloc.models import list_models
 from mambaloc.models.registry import model_class
 
@@ -27,8 +26,8 @@ class OneLineErrorParser(LightningArgumentParser):
         unknown = re.search(r"Expected a dot import path string: (\w+)", said)
         if unknown and '"model' in said:
             systems = [model_class(name).__name__ for name in list_models()]
-            near = get_close_matches(unknown[1], systems, n=3, cutoff=0.4) or systems
-            raise InputError(f"model.class_path {unknown[1]}: there is none; did you mean {', '.join(near)}?")
+            closest = suggestion(unknown[1], systems)
+            raise InputError(f"model.class_path {unknown[1]}: there is no such class. {closest}")
         remedy = "; --help lists the options"  # a subcommand's parser reports to its parent, which reports again
         raise InputError(said.replace("typing.", "").removesuffix(remedy) + remedy)
 

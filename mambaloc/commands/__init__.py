@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from difflib import get_close_matches
 from importlib import import_module
+
+from mambaloc.errors import suggestion
 
 _MODULES = {
     "train": ("train", "train a recipe"),
@@ -33,9 +34,7 @@ def main() -> None:
         print(_USAGE.format("\n".join(f"  {each:<10} {does}" for each, (_, does) in _MODULES.items())))
         return
     if name not in _MODULES:
-        near = get_close_matches(name, _MODULES, n=1)
-        hint = f"Did you mean {near[0]}?" if near else f"Choose one of {', '.join(_MODULES)}."
-        print(f"error: mambaloc {name}: there is no such command. {hint}", file=sys.stderr)
+        print(f"error: mambaloc {name}: there is no such command. {suggestion(name, _MODULES)}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [f"mambaloc {name}", *words]
     import_module(f"{__name__}.{_MODULES[name][0]}").main()

@@ -162,8 +162,13 @@ class LitPoseRegressor(L.LightningModule):
         """Take the scene's position statistics, and compile what the epochs run, before the first epoch.
 
         Raises:
-            InputError: where nothing can compile it.
+            InputError: for a class without a name, whose checkpoints nothing could load; where nothing can compile it.
         """
+        if stage == "fit" and not hasattr(self, "registry_name"):
+            raise InputError(
+                f"{type(self).__name__}: has no name, so its checkpoints could not be loaded. "
+                "Write @register_model('NAME') above the class."
+            )
         if stage == "fit":
             keep_freed_memory()
         if stage == "fit" and self.normalise_position:

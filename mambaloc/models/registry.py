@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from fnmatch import fnmatch
+from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, suggestion
 from mambaloc.models.base import LitPoseRegressor
+
+ENTRY_POINTS = "mambaloc.models"
+"""Group of the entry points by which installed packages name systems of theirs."""
 
 _MODELS: dict[str, type[LitPoseRegressor]] = {}
 _System = TypeVar("_System", bound=type[LitPoseRegressor])
@@ -35,19 +38,24 @@ def register_model(name: str) -> Callable[[_System], _System]:
 
 
 def list_models(pattern: str = "*") -> list[str]:
-    """Names of the registered systems that match a wildcard, sorted."""
-    return sorted(name for name in _MODELS if fnmatch(name, pattern))
+    """Names of the systems that match a wildcard, those of other installed packages among them, sorted."""
+    return sorted(name for name in {*_MODELS, *entry_points(group=ENTRY_POINTS).names} if fnmatch(name, pattern))
 
 
 def model_class(name: str) -> type[LitPoseRegressor]:
-    """Return the class registered as ``name``.
+    """Return the class registered as ``name``, here or by an entry point of an installed package.
 
     Raises:
-        InputError: for an unknown name, with near misses.
+        InputError: for an unknown name, with near misses, and for an entry point that cannot be loaded.
     """
     if name not in _MODELS:
-        near = difflib.get_close_matches(name, _MODELS, n=3, cutoff=0.4) or list_models()
-        raise InputError(f"model {name!r}: there is none; did you mean {', '.join(near)}?")
+        _load_from_packages(name)
+    if name not in _MODELS:
+        if "." in name:
+            raise InputError(
+                f"unknown model {name!r}. Names with a dot are of trained models: use mambaloc.load({name!r})."
+            )
+        raise InputError(f"unknown model {name!r}. {suggestion(name, list_models())}")
     return _MODELS[name]
 
 
@@ -58,3 +66,14 @@ def create_model(name: str, **kwargs: Any) -> LitPoseRegressor:
         InputError: for an unknown name.
     """
     return model_class(name)(**kwargs)
+
+
+def _load_from_packages(name: str) -> None:
+    for point in entry_points(group=ENTRY_POINTS, name=name):
+        try:
+            point.load()  # whose register_model does the rest
+        except (ImportError, AttributeError) as error:
+            package = point.dist.name if point.dist else point.value
+            raise InputError(
+                f"model {name!r}: package {package} cannot be loaded ({error}). Install it anew."
+            ) from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +13,7 @@ from timm.models import group_parameters
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, suggestion
 from mambaloc.nn.winograd import use_winograd
 
 
@@ -209,8 +208,7 @@ def _timm_model(name: str, weights: str | None, timm_args: dict[str, Any] | None
 
 def _check_known(name: str) -> None:
     if not timm.is_model(name):
-        near = get_close_matches(name, timm.list_models(), n=5) or ["see timm.list_models()"]
-        raise InputError(f"backbone {name!r}: timm has no such model; near ones: {', '.join(near)}")
+        raise InputError(f"backbone {name!r}: timm has no such model. {suggestion(name, timm.list_models())}")
 
 
 def _stages_at(name: str, strides: tuple[int, ...]) -> list[int]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import re
-from difflib import get_close_matches
 from pathlib import Path
 
 from huggingface_hub import snapshot_download
 from safetensors import SafetensorError
 from safetensors.torch import load as tensors_of
 
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, suggestion
 from mambaloc.files import shipped_folders
 from mambaloc.models import Checkpoint, LitPoseRegressor, create_model
 from mambaloc.runtime.maps import MAP_FILE
@@ -19,7 +18,7 @@ from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest
 
 _ZOOS = shipped_folders("zoo")
 
-_SOURCES = "give a checkpoint, 'ARCH.TAG' (see list_released()), 'local-dir:FOLDER', or 'hf-hub:ORG/NAME@REVISION'"
+_SOURCES = "Sources are a checkpoint, 'ARCH.TAG', 'local-dir:FOLDER' and 'hf-hub:ORG/NAME@REVISION'."
 
 
 def list_released() -> list[str]:
@@ -61,8 +60,7 @@ def released_folder(source: str) -> Path:
     for zoo in _ZOOS:
         if re.fullmatch(r"[a-z0-9_]+\.[a-z0-9_]+", source) and (zoo / source / MANIFEST_FILE).is_file():
             return zoo / source
-    near = get_close_matches(source, list_released(), n=1)
-    raise InputError(f"{source}: no such model; " + (f"did you mean {near[0]}?" if near else _SOURCES))
+    raise InputError(f"{source}: no such model. {suggestion(source, list_released())} {_SOURCES}")
 
 
 def load_released(folder: Path) -> LitPoseRegressor:

@@ -42,10 +42,11 @@ class Transform:
 def create_transform(system: LitPoseRegressor) -> Transform:
     """Make the transform of a trained system's pictures.
 
-    >>> system = mambaloc.load("denseloc.embedded_room")
-    >>> prediction = system(mambaloc.create_transform(system)("picture.png")[None])
-
     Systems that use a camera's intrinsics then take those of their training camera.
+
+    Examples:
+        >>> system = mambaloc.load("denseloc.embedded_room")
+        >>> prediction = system(mambaloc.create_transform(system)("picture.png")[None])
 
     Args:
         system: as :func:`mambaloc.load` returns it.

@@ -312,7 +312,7 @@ def test_a_crop_that_can_fit_no_image_is_refused_before_reading(make):
     ("options", "message"),
     [
         ({"scene": "heads"}, "mambaloc download 7scenes heads --root"),
-        ({"scene": "haeds"}, "did you mean heads?"),
+        ({"scene": "haeds"}, "Did you mean heads?"),
         ({"dataset": "cambridge", "scene": "ShopFacade"}, "mambaloc download cambridge ShopFacade --root"),
         ({"dataset": "8scenes"}, "data.dataset '8scenes': there is none; choose one of 7scenes, cambridge, embedded"),
         ({"val_sequences": ["seq-09"]}, "data.val_sequences: no seq-09 in the training split"),

@@ -67,7 +67,7 @@ def test_a_registered_model_is_created_with_its_arguments():
 
 @pytest.mark.parametrize("name", ["mamba_loc", "MambaLoc", "mambalok"])
 def test_a_near_miss_is_answered_with_the_name(name):
-    with pytest.raises(InputError, match="did you mean mambaloc") as error:
+    with pytest.raises(InputError, match="Did you mean mambaloc") as error:
         create_model(name)
     assert "\n" not in str(error.value)
 
@@ -207,3 +207,29 @@ def test_torch_files_that_are_not_ours_are_refused(tmp_path, read, value):
 def test_missing_checkpoints_and_folders_are_refused(tmp_path, read):
     refused(read, tmp_path / "gone.ckpt", "no such checkpoint")
     refused(read, tmp_path, "no such checkpoint")
+
+
+class LitUnnamed(LitPoseRegressor):
+    def configure_network(self) -> Mean:
+        return Mean()
+
+
+def test_a_class_without_a_name_is_refused_before_it_is_trained():
+    with pytest.raises(InputError, match=r"LitUnnamed: has no name.*Write @register_model\('NAME'\) above the class"):
+        LitUnnamed().setup("fit")
+
+
+def test_a_released_model_is_loaded_and_not_created():
+    with pytest.raises(InputError, match=r"use mambaloc.load\('denseloc.embedded_room'\)"):
+        create_model("denseloc.embedded_room")
+
+
+def test_a_package_that_cannot_be_loaded_is_named(tmp_path, monkeypatch):
+    about = tmp_path / "others-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: others\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[mambaloc.models]\nothers = others_that_are_not_there:Lit\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "others" in list_models()
+    with pytest.raises(InputError, match="package others cannot be loaded"):
+        create_model("others")

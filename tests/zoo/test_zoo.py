@@ -101,7 +101,7 @@ def test_a_name_finds_it(released, monkeypatch):
     monkeypatch.setattr("mambaloc.zoo.loading._ZOOS", (released.parent,))
     assert list_released() == ["mambaloc.tiny"]
     assert type(mambaloc.load("mambaloc.tiny")) is LitMambaLoc
-    with pytest.raises(InputError, match=r"mambaloc\.tin: no such model; did you mean mambaloc\.tiny"):
+    with pytest.raises(InputError, match=r"mambaloc\.tin: no such model. Did you mean mambaloc\.tiny"):
         mambaloc.load("mambaloc.tin")
     with pytest.raises(InputError, match="hf-hub:ORG/NAME@REVISION"):
         mambaloc.load("something else")

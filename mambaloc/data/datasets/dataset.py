@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 
 from mambaloc.data.frames import BadFrames, Frames, Split
-from mambaloc.errors import InputError
+from mambaloc.errors import InputError, suggestion
 
 
 @dataclass(frozen=True)
@@ -63,13 +62,13 @@ class Source:
             InputError: for an unknown scene, with the nearest name.
         """
         if scene not in self.archives:
-            raise InputError(f"{scene!r} is no scene of {self.title}: {nearest(scene, [*self.archives, 'all'])}")
+            raise InputError(f"{scene!r} is no scene of {self.title}. {suggestion(scene, [*self.archives, 'all'])}")
         return self.archives[scene]
 
     def how_to_get(self, scene: str, root: Path) -> str:
         """One line on how to get a scene that is not in ``root``."""
         if scene not in self.archives:
-            return f"{scene} is not in {root}, nor a scene of {self.title}: {nearest(scene, list(self.archives))}"
+            return f"{scene} is not in {root}, nor a scene of {self.title}. {suggestion(scene, self.archives)}"
         elsewhere = "" if root == self.default_root else f" --root {root}"
         return (
             f"{scene} is not in {root}; {self.title} is at {self.page} ({self.terms}); "
@@ -96,10 +95,3 @@ class Dataset:
     default_root: Path
     marks_validation: bool = False
     source: Source | None = None
-
-
-def nearest(name: str, names: list[str]) -> str:
-    """A question for the closest of some names; all of them where none is close."""
-    by_lower = {known.lower(): known for known in names}
-    close = get_close_matches(name.lower(), by_lower, n=1)
-    return f"did you mean {by_lower[close[0]]}?" if close else f"give one of {', '.join(names)}"

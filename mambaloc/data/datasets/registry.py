@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mambaloc.data.datasets import cambridge, capture, seven_scenes
 from mambaloc.data.datasets.capture import CAPTURE
-from mambaloc.data.datasets.dataset import Dataset, Source, nearest
-from mambaloc.errors import InputError
+from mambaloc.data.datasets.dataset import Dataset, Source
+from mambaloc.errors import InputError, suggestion
 from mambaloc.user_cache import default_cache_dir
 
 EMBEDDED = "embedded"
@@ -97,7 +97,7 @@ def find_source(dataset: str) -> Source:
         InputError: for one without a known address, with the nearest name.
     """
     if dataset not in SOURCES:
-        raise InputError(f"{dataset!r} is no dataset with a known address: {nearest(dataset, list(SOURCES))}")
+        raise InputError(f"{dataset!r} is no dataset with a known address. {suggestion(dataset, SOURCES)}")
     return SOURCES[dataset]
 
 

@@ -442,10 +442,10 @@ def test_all_gets_every_scene(server: Server, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: download("7scene", "heads"), "'7scene' is no dataset .* did you mean 7scenes?"),
-        (lambda: download("7scenes", "haeds"), "'haeds' is no scene of 7-Scenes: did you mean heads?"),
-        (lambda: download("cambridge", "kingscollege"), "did you mean KingsCollege?"),
-        (lambda: download("7scenes", "zzz"), "give one of chess, fire, heads, .*, all"),
+        (lambda: download("7scene", "heads"), "'7scene' is no dataset .* Did you mean 7scenes?"),
+        (lambda: download("7scenes", "haeds"), "'haeds' is no scene of 7-Scenes. Did you mean heads?"),
+        (lambda: download("cambridge", "kingscollege"), "Did you mean KingsCollege?"),
+        (lambda: download("7scenes", "zzz"), "Choose one of chess, fire, heads, .*, all"),
         (lambda: download("7scenes", None), "7scenes needs a scene: give one of chess, .*, or all"),
     ],
 )
@@ -460,7 +460,7 @@ def test_how_to_get_is_one_line_with_the_command() -> None:
         "get it with: mambaloc download 7scenes heads"
     )
     assert how_to_get("cambridge", "Street", Path("/big")).endswith("mambaloc download cambridge Street --root /big")
-    assert how_to_get("7scenes", "chees", Path("d")).endswith("nor a scene of 7-Scenes: did you mean chess?")
+    assert how_to_get("7scenes", "chees", Path("d")).endswith("nor a scene of 7-Scenes. Did you mean chess?")
 
 
 def test_the_table_of_addresses_is_sane() -> None:
@@ -488,4 +488,4 @@ def test_the_tool_ends_in_one_line_and_code_2(tmp_path: Path) -> None:
         text=True,
     )
     assert done.returncode == 2
-    assert done.stderr == "error: 'haeds' is no scene of 7-Scenes: did you mean heads?\n"
+    assert done.stderr == "error: 'haeds' is no scene of 7-Scenes. Did you mean heads?\n"
