@@ -46,13 +46,14 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
     import yaml  # only here: exported models run without it
 
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        data = yaml.safe_load(text.removeprefix("%YAML:1.0"))  # as OpenCV's FileStorage spells the directive
         if _expanded(data, {}) > _MOST_VALUES:
             raise InputError(f"{path}: its aliases stand for more than {_MOST_VALUES} values; write them out")
         return data
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a ValueError: no UTF-8, or no number or date
         raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); {broken}") from None
 
 

@@ -13,6 +13,7 @@ from mambaloc.importing.formats import (
     arkit,
     colmap,
     csv_table,
+    euroc,
     kitti,
     nerfstudio,
     pose_files,
@@ -56,6 +57,7 @@ FORMATS: dict[str, Format] = {
         stray_scanner.is_stray_scanner,
         stray_scanner.read_stray_scanner,
     ),
+    "euroc": Format("mav0/cam0 and mav0/state_groundtruth_estimate0 of EuRoC", euroc.is_euroc, euroc.read_euroc, True),
     "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd, True),
     "kitti": Format("poses/ and sequences/", kitti.is_kitti, kitti.read_kitti),
     "7scenes": Format(

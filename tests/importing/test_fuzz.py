@@ -28,6 +28,7 @@ EYE16 = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 LENS = {"w": 6, "h": 4, "fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0}
 KEYFRAME = {f"t_{i}{j}": float(i == j) for i in range(3) for j in range(4)} | LENS | {"width": 6, "height": 4}
 METADATA = {"poses": [[0, 0, 0, 1, k, 0, 0] for k in range(2)], "K": [5, 0, 0, 0, 5, 0, 3, 2, 1], "w": 6, "h": 4}
+SENSOR = f"T_BS: {{data: {np.eye(4).ravel().tolist()}}}\nresolution: [6, 4]\nintrinsics: [5, 5, 3, 2]\n"
 HEADER = "scene,split,image,x,y,z,qw,qx,qy,qz,time\n"
 
 # Files of a small whole source of each format, and which of them is damaged.
@@ -36,6 +37,22 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
         {"rgb.txt": "1.0 rgb/1.png\n2.0 rgb/2.png\n", "groundtruth.txt": "1.01 0 0 0 0 0 0 1\n1.99 1 0 0 0 0 0 1\n"}
         | {f"rgb/{k}.png": PICTURE for k in (1, 2)},
         ("rgb.txt", "groundtruth.txt"),
+    ),
+    "euroc": (
+        {
+            "mav0/cam0/data.csv": "#timestamp [ns],filename\n1000000000,1.png\n2000000000,2.png\n",
+            "mav0/cam0/sensor.yaml": SENSOR
+            + "distortion_model: radial-tangential\ndistortion_coefficients: [0.1, 0, 0, 0]\n",
+            "mav0/state_groundtruth_estimate0/data.csv": "1000000000,0,0,0,1,0,0,0\n2000000000,1,0,0,1,0,0,0\n",
+            "mav0/state_groundtruth_estimate0/sensor.yaml": SENSOR,
+        }
+        | {f"mav0/cam0/data/{k}.png": PICTURE for k in (1, 2)},
+        (
+            "mav0/cam0/data.csv",
+            "mav0/cam0/sensor.yaml",
+            "mav0/state_groundtruth_estimate0/data.csv",
+            "mav0/state_groundtruth_estimate0/sensor.yaml",
+        ),
     ),
     "tum": ({"a.tum": "1.0 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", "1.0.png": PICTURE, "2.png": PICTURE}, ("a.tum",)),
     "kitti": (

@@ -20,6 +20,13 @@ FILES = {
         "depth/000000.png",
         "confidence/000000.png",
     ],
+    "euroc": [
+        "mav0/cam0/data.csv",
+        "mav0/cam0/sensor.yaml",
+        "mav0/cam0/data/1.png",
+        "mav0/imu0/data.csv",
+        "mav0/state_groundtruth_estimate0/data.csv",
+    ],
     "tum_rgbd": ["rgb.txt", "depth.txt", "groundtruth.txt", "accelerometer.txt", "rgb/1.2.png"],
     "kitti": ["poses/00.txt", "sequences/00/image_2/000000.png", "sequences/00/calib.txt"],
     "7scenes": ["TrainSplit.txt", "TestSplit.txt", "seq-01/frame-000000.color.png", "seq-01/frame-000000.pose.txt"],
@@ -46,6 +53,7 @@ WRITTEN = {
 ALSO = [
     ("record3d", ["metadata.json", "rgb/0.png"]),
     ("polycam", ["corrected_cameras/1.json", "corrected_images/1.jpg"]),
+    ("euroc", ["cam0/data.csv", "cam0/sensor.yaml", "mocap0/data.csv", "imu0/data.csv"]),
     ("scannet", ["frames/color/0.jpg", "frames/pose/0.txt"]),
     ("colmap", ["cameras.txt", "images.txt", "points3D.txt"]),
     ("colmap", ["sparse/images.txt", "images/a.jpg"]),
