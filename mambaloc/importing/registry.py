@@ -15,6 +15,7 @@ from mambaloc.importing.formats import (
     csv_table,
     euroc,
     kitti,
+    metashape,
     nerfstudio,
     pose_files,
     pose_folders,
@@ -68,6 +69,9 @@ FORMATS: dict[str, Format] = {
     "scannet": Format("color/ and pose/", pose_folders.is_scannet, pose_folders.read_scannet),
     "replica": Format("traj.txt and results/", pose_folders.is_replica, pose_folders.read_replica),
     "colmap": Format("cameras, images and points3D", colmap.is_colmap, colmap.read_colmap, True),
+    "metashape": Format(
+        "cameras.xml, exported by Agisoft Metashape", metashape.is_metashape, metashape.read_metashape, True
+    ),
     "csv": Format("a .csv with columns image,x,y,z,qw,qx,qy,qz", csv_table.is_csv, csv_table.read_csv, True),
     "csv_world_from_cam": Format(
         "the same", _by_name_alone, partial(csv_table.read_csv, direction="world_from_cam"), True

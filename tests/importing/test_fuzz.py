@@ -29,6 +29,14 @@ LENS = {"w": 6, "h": 4, "fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0}
 KEYFRAME = {f"t_{i}{j}": float(i == j) for i in range(3) for j in range(4)} | LENS | {"width": 6, "height": 4}
 METADATA = {"poses": [[0, 0, 0, 1, k, 0, 0] for k in range(2)], "K": [5, 0, 0, 0, 5, 0, 3, 2, 1], "w": 6, "h": 4}
 SENSOR = f"T_BS: {{data: {np.eye(4).ravel().tolist()}}}\nresolution: [6, 4]\nintrinsics: [5, 5, 3, 2]\n"
+SHOT = '<camera id="{0}" sensor_id="0" component_id="0" label="{0}"><transform>' + EYE16.replace("\n", " ")
+METASHAPE = (
+    '<document><chunk><sensors><sensor id="0" type="frame"><resolution width="6" height="4"/><calibration><f>5</f>'
+    '<k1>0.1</k1></calibration></sensor></sensors><components><component id="0"><transform><rotation>1 0 0 0 1 0 0 0 1'
+    "</rotation><translation>0 0 0</translation><scale>2</scale></transform></component></components><cameras>"
+    + "".join(f"{SHOT.format(k)}</transform></camera>" for k in (1, 2))
+    + "</cameras></chunk></document>"
+)
 HEADER = "scene,split,image,x,y,z,qw,qx,qy,qz,time\n"
 
 # Files of a small whole source of each format, and which of them is damaged.
@@ -89,6 +97,7 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
         | {f"keyframes/cameras/{k}.json": json.dumps(KEYFRAME) for k in (1, 2)},
         ("keyframes/cameras/1.json",),
     ),
+    "metashape": ({"a.xml": METASHAPE} | {f"{k}.png": PICTURE for k in (1, 2)}, ("a.xml",)),
     "pose_lines": (
         {"a.txt": "1.png 1 0 0 0 0 0 0\n2.png 1 0 0 0 1 0 0\n", "1.png": PICTURE, "2.png": PICTURE}
         | {"intrinsics.txt": "1.png 5 5 3 2 6 4\n2.png 5 5 3 2 6 4\n"},

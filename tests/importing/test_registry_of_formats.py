@@ -39,12 +39,14 @@ FILES = {
     "structure_from_motion": ["a.jpg", "b.jpg", "notes.txt"],
 }
 WRITTEN = {
+    "metashape": {"photos/1.jpg": "", "export.xml": '<?xml version="1.0"?>\n<document version="2">\n<chunk></chunk>'},
     "pose_lines": {"images/1.jpg": "", "images/2.jpg": "", "any.log": f"{MATRIX}\n{MATRIX}\n"},
     "pose_files": {"1.color.png": "", "1.pose.txt": MATRIX, "seq-02/1.color.png": "", "seq-02/1.pose.txt": MATRIX},
     "tum": {"images/1.2.jpg": "", "path.txt": "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1 0\n"},
     "kitti_poses": {"images/1.jpg": "", "path.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2},
     "structure_from_motion": {
         "1.jpg": "",
+        "1.xml": "<annotation><object/></annotation>",
         "1.txt": "0 0.5 0.5 0.1 0.1\n",
         "intrinsics.txt": "500 0 320 0 500 240 0 0 1\n",
     },
