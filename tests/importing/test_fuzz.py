@@ -80,6 +80,12 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
         | {"seq-01/frame-000000.depth.png": DEPTH},
         ("TrainSplit.txt", "seq-01/frame-000000.pose.txt", "seq-01/frame-000000.depth.png", "camera-intrinsics.txt"),
     ),
+    "map_free": (
+        {"poses.txt": "seq0/1.png 1 0 0 0 0 0 0\nseq1/2.png 1 0 0 0 1 0 0\n"}
+        | {"intrinsics.txt": "seq0/1.png 5 5 3 2 6 4\nseq1/2.png 5 5 3 2 6 4\n"}
+        | {f"seq{k - 1}/{k}.png": PICTURE for k in (1, 2)},
+        ("poses.txt", "intrinsics.txt"),
+    ),
     "scannet": (
         {f"color/{k}.png": PICTURE for k in (1, 2)}
         | {f"pose/{k}.txt": EYE16 for k in (1, 2)}

@@ -39,6 +39,12 @@ FILES = {
     "structure_from_motion": ["a.jpg", "b.jpg", "notes.txt"],
 }
 WRITTEN = {
+    "map_free": {
+        "seq1/1.jpg": "",
+        "poses.txt": "# name qw qx qy qz tx ty tz\nseq1/1.jpg 1 0 0 0 0 0 0\nseq1/2.jpg 0 0 0 0 0 0 0\n",
+        "poses_device.txt": "seq1/1.jpg 1 0 0 0 0 0 0\nseq1/2.jpg 1 0 0 0 1 0 0\n",
+        "intrinsics.txt": "seq1/1.jpg 5 5 3 2 6 4\n",
+    },
     "metashape": {"photos/1.jpg": "", "export.xml": '<?xml version="1.0"?>\n<document version="2">\n<chunk></chunk>'},
     "pose_lines": {"images/1.jpg": "", "images/2.jpg": "", "any.log": f"{MATRIX}\n{MATRIX}\n"},
     "pose_files": {"1.color.png": "", "1.pose.txt": MATRIX, "seq-02/1.color.png": "", "seq-02/1.pose.txt": MATRIX},
