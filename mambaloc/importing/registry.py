@@ -21,6 +21,7 @@ from mambaloc.importing.formats import (
     pose_files,
     pose_folders,
     pose_lines,
+    realityscan,
     seven_scenes,
     stray_scanner,
     tum,
@@ -78,6 +79,12 @@ FORMATS: dict[str, Format] = {
     "colmap": Format("cameras, images and points3D", colmap.is_colmap, colmap.read_colmap, True),
     "metashape": Format(
         "cameras.xml, exported by Agisoft Metashape", metashape.is_metashape, metashape.read_metashape, True
+    ),
+    "realityscan": Format(
+        "a .csv with columns name,x,y,alt,heading,pitch,roll,f of RealityScan or RealityCapture",
+        realityscan.is_realityscan,
+        realityscan.read_realityscan,
+        True,
     ),
     "csv": Format("a .csv with columns image,x,y,z,qw,qx,qy,qz", csv_table.is_csv, csv_table.read_csv, True),
     "csv_world_from_cam": Format(

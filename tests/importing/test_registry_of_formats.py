@@ -45,6 +45,10 @@ WRITTEN = {
         "poses_device.txt": "seq1/1.jpg 1 0 0 0 0 0 0\nseq1/2.jpg 1 0 0 0 1 0 0\n",
         "intrinsics.txt": "seq1/1.jpg 5 5 3 2 6 4\n",
     },
+    "realityscan": {
+        "photos/1.jpg": "",
+        "any.csv": "#cameras 1\n#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm\n1.jpg,0,0,0,0,0,0,30,0\n",
+    },
     "metashape": {"photos/1.jpg": "", "export.xml": '<?xml version="1.0"?>\n<document version="2">\n<chunk></chunk>'},
     "pose_lines": {"images/1.jpg": "", "images/2.jpg": "", "any.log": f"{MATRIX}\n{MATRIX}\n"},
     "pose_files": {"1.color.png": "", "1.pose.txt": MATRIX, "seq-02/1.color.png": "", "seq-02/1.pose.txt": MATRIX},

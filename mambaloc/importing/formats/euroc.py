@@ -183,9 +183,13 @@ def _camera(path: Path) -> tuple[Camera, Matrices]:
     if model in _NO_LENS and not told:
         return camera, body_from_cam
     if not isinstance(model, str) or model not in _LENSES:
-        raise InputError(f"{path}: distortion_model {str(model)[:40]!r} is none of {', '.join(_LENSES)}; calibrate it so")
+        raise InputError(
+            f"{path}: distortion_model {str(model)[:40]!r} is none of {', '.join(_LENSES)}; calibrate it so"
+        )
     lens, counts = _LENSES[model]
     coefficients = array_of(told, (None,), "distortion_coefficients", path).tolist()
     if len(coefficients) not in counts:
-        raise InputError(f"{path}: has {len(coefficients)} distortion_coefficients, {model} has {counts[0]}; correct it")
+        raise InputError(
+            f"{path}: has {len(coefficients)} distortion_coefficients, {model} has {counts[0]}; correct it"
+        )
     return replace(camera, distorted=lens(camera.focal_px, camera.centre_px, coefficients), model=model), body_from_cam
