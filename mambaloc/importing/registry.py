@@ -14,6 +14,7 @@ from mambaloc.importing.formats import (
     colmap,
     csv_table,
     euroc,
+    kapture,
     kitti,
     map_free,
     metashape,
@@ -61,6 +62,12 @@ FORMATS: dict[str, Format] = {
         stray_scanner.read_stray_scanner,
     ),
     "euroc": Format("mav0/cam0 and mav0/state_groundtruth_estimate0 of EuRoC", euroc.is_euroc, euroc.read_euroc, True),
+    "kapture": Format(
+        "sensors/ with sensors.txt, records_camera.txt and trajectories.txt of kapture",
+        kapture.is_kapture,
+        kapture.read_kapture,
+        True,
+    ),
     "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd, True),
     "kitti": Format("poses/ and sequences/", kitti.is_kitti, kitti.read_kitti),
     "7scenes": Format(

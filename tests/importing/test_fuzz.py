@@ -62,6 +62,16 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
             "mav0/state_groundtruth_estimate0/sensor.yaml",
         ),
     ),
+    "kapture": (
+        {
+            "sensors/sensors.txt": "# kapture format: 1.1\ncam0, , camera, SIMPLE_RADIAL, 6, 4, 5, 3, 2, 0.1\n",
+            "sensors/records_camera.txt": "0, cam0, 1.png\n1, cam0, 2.png\n",
+            "sensors/trajectories.txt": "0, rig, 1, 0, 0, 0, 0, 0, 0\n1, cam0, 1, 0, 0, 0, 1, 0, 0\n",
+            "sensors/rigs.txt": "rig, cam0, 1, 0, 0, 0, 0, 0, 0\n",
+        }
+        | {f"sensors/records_data/{k}.png": PICTURE for k in (1, 2)},
+        tuple(f"sensors/{name}.txt" for name in ("sensors", "records_camera", "trajectories", "rigs")),
+    ),
     "tum": ({"a.tum": "1.0 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", "1.0.png": PICTURE, "2.png": PICTURE}, ("a.tum",)),
     "kitti": (
         {"poses/00.txt": EYE12 * 2, "sequences/00/times.txt": "0\n1\n", "sequences/00/image_2/000000.png": PICTURE}

@@ -45,6 +45,12 @@ WRITTEN = {
         "poses_device.txt": "seq1/1.jpg 1 0 0 0 0 0 0\nseq1/2.jpg 1 0 0 0 1 0 0\n",
         "intrinsics.txt": "seq1/1.jpg 5 5 3 2 6 4\n",
     },
+    "kapture": {
+        "mapping/sensors/sensors.txt": "# kapture format: 1.1\n",
+        "mapping/sensors/records_camera.txt": "",
+        "mapping/sensors/trajectories.txt": "",
+        "mapping/sensors/records_data/a.jpg": "",
+    },
     "realityscan": {
         "photos/1.jpg": "",
         "any.csv": "#cameras 1\n#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm\n1.jpg,0,0,0,0,0,0,30,0\n",

@@ -4,9 +4,9 @@
 sensor's pose in the body's frame (row after row), ``intrinsics`` fu, fv, cu, cv in OpenCV's pixels, and the lens:
 ``radial-tangential`` is OpenCV's k1, k2, p1, p2, ``equidistant`` its fisheye.
 ``mav0/state_groundtruth_estimate0/data.csv`` has rows ``timestamp [ns], p_RS_R, q_RS, ...``: position and orientation,
-scalar first, of a sensor S in the reference frame R, in metres. Its own ``sensor.yaml`` says where S is on the body; the
-identity unless it does. So ``world_from_cam = world_from_S @ inv(body_from_S) @ body_from_cam``. TUM-VI calls the folder
-``mocap0``. Source: Burri et al. 2016, "The EuRoC micro aerial vehicle datasets", and the recordings' own files.
+scalar first, of a sensor S in the reference frame R, in metres. Its own ``sensor.yaml`` says where S is on the body;
+the identity unless it does. So ``world_from_cam = world_from_S @ inv(body_from_S) @ body_from_cam``. TUM-VI calls the
+folder ``mocap0``. Source: Burri et al. 2016, "The EuRoC micro aerial vehicle datasets", and the recordings' own files.
 """
 
 from __future__ import annotations

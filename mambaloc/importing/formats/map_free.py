@@ -2,7 +2,7 @@
 
 ``poses.txt`` has lines ``seq1/frame_00012.jpg qw qx qy qz tx ty tz``: world-to-camera, scalar first, in metres, in
 OpenCV's axes. Zeros throughout mark a pose that is kept back, as in the scenes of the test set, and a frame without a
-line was lost. ``intrinsics.txt`` has lines ``seq1/frame_00012.jpg fx fy cx cy width height``, a camera for each picture,
+line was lost. ``intrinsics.txt`` has lines ``seq1/frame_00012.jpg fx fy cx cy width height``, a camera a picture,
 whose pixels count from the centre of the top-left one, as ``correct_intrinsic_scale`` of the reference loader has it.
 ``poses_device.txt`` are those of the phone's own tracking, in worlds of their own. Source: readme,
 ``lib/datasets/mapfree.py`` and ``utils.py`` of github.com/nianticlabs/map-free-reloc (Arnold et al. 2022).

@@ -2,7 +2,7 @@
 
 Sixteen numbers are a 4x4 matrix, camera-to-world; lines without a name are those of the pictures in natural order. A
 name may stand before twelve or sixteen numbers, or before seven: ``name qw qx qy qz tx ty tz`` is **world-to-camera**,
-scalar first, as in COLMAP's ``images.txt`` and in hloc's results; with the position first, a line that names the columns
+scalar first, as in COLMAP's ``images.txt`` and hloc's results; with the position first, a line that names the columns
 must say where the scalar is, and poses are camera-to-world. ``intrinsics.txt`` with lines ``name fx fy cx cy width
 height`` is Map-free's.
 """

@@ -1,8 +1,8 @@
 """Metashape's cameras: poses against SciPy, lenses against OpenCV and by hand, and every bad input named.
 
 Guesses, made before they were looked up: transforms are camera-to-chunk in OpenCV's axes (right); cx and cy are offsets
-from the middle (right); p1 and p2 are OpenCV's (wrong: they are the other way round); the scale is of the chunk, so that
-positions are multiplied by it before they are turned (right).
+from the middle (right); p1 and p2 are OpenCV's (wrong: they are the other way round); the scale is of the chunk, so
+that positions are multiplied by it before they are turned (right).
 """
 
 from __future__ import annotations
