@@ -116,7 +116,8 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
     "metashape": ({"a.xml": METASHAPE} | {f"{k}.png": PICTURE for k in (1, 2)}, ("a.xml",)),
     "realityscan": (
         {
-            "a.csv": "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,t1\n1.png,0,0,0,9,80,-9,30,0,0,0.1,0\n2.png,1,0,0,0,90,0,30,0,0,0,0\n"
+            "a.csv": "#name,x,y,alt,heading,pitch,roll,f,px,k1,t1\n1.png,0,0,0,9,80,-9,30,0,0.1,0\n"
+            "2.png,1,0,0,0,90,0,30,0,0,0\n"
         }
         | {f"{k}.png": PICTURE for k in (1, 2)},
         ("a.csv",),

@@ -4,7 +4,8 @@
 pixels count from the image's corner; ``records_camera.txt`` rows ``timestamp, sensor, image`` below ``records_data``;
 ``trajectories.txt`` rows ``timestamp, device, qw, qx, qy, qz, tx, ty, tz``, world-to-device, where numbers may be left
 out; ``rigs.txt`` rows ``rig, sensor, qw, ..., tz``, rig-to-sensor, where a sensor may be another rig. A time stamp may
-be a counter. Values stand between commas, and none holds one. Source: ``kapture_format.adoc`` of github.com/naver/kapture.
+be a counter. Values stand between commas, and none holds one. Source: ``kapture_format.adoc`` of
+github.com/naver/kapture.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@ A line names the columns ``#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,
 ``f_35mm``, ``px_norm`` and ``py_norm``; a row is a picture. Position is the camera's centre. Angles are in degrees:
 ``world_from_cam = Rz(-heading) Rx(pitch) Ry(roll)`` in OpenGL's camera axes, so that zeros look down with north up. The
 focal length is for a picture 36 mm long, the principal point a share of the longer side from the picture's middle,
-right and down. The lens is that of :mod:`mambaloc.importing.formats.photogrammetric_lens`, with t1 and t2 as p1 and p2. The
-world is that which was asked for in the export, and its unit is not in the file. Source: the export formats that ship
-with RealityScan 2.2 (``calibration.xml``: ``$(f*36)``, ``$(px*scale+width*0.5)``, OpenCV's p1 and p2 as t2 and t1), as
-quoted by readers of it; ``realitycapture_utils.py`` of nerfstudio (angles) and the importer of XMP of AliceVision
+right and down. The lens is that of :mod:`mambaloc.importing.formats.photogrammetric_lens`, with t1 and t2 as p1 and p2.
+The world is that which was asked for in the export, and its unit is not in the file. Source: the export formats that
+ship with RealityScan 2.2 (``calibration.xml``: ``$(f*36)``, ``$(px*scale+width*0.5)``, OpenCV's p1 and p2 as t2 and t1)
+as readers of it quote them; ``realitycapture_utils.py`` of nerfstudio (angles) and AliceVision's importer of XMP
 (principal point). nerfstudio divides px and py by 36 and takes t1 for OpenCV's p1, which its own comments call a guess.
 """
 
