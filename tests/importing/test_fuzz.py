@@ -128,8 +128,10 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
         ("a.txt", "intrinsics.txt"),
     ),
     "pose_files": (
-        {f"{k}.color.png": PICTURE for k in (1, 2)} | {f"{k}.pose.txt": EYE16 for k in (1, 2)},
-        ("1.pose.txt", "1.color.png"),
+        {f"train/rgb/{k}.color.png": PICTURE for k in (1, 2)}
+        | {f"train/poses/{k}.pose.txt": EYE16 for k in (1, 2)}
+        | {"train/calibration/1.txt": "5.0\n", "train/calibration/2.txt": "5 0 3\n0 5 2\n0 0 1\n"},
+        ("train/poses/1.pose.txt", "train/rgb/1.color.png", "train/calibration/1.txt", "train/calibration/2.txt"),
     ),
     "csv": (
         {"a.csv": HEADER + "den,train,1.png,0,0,0,1,0,0,0,1\nden,test,2.png,1,0,0,1,0,0,0,2\n"}

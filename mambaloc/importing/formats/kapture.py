@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import Checked, Matrices, Posed, build_capture, from_quaternions
@@ -24,7 +25,7 @@ from mambaloc.importing.formats.kapture_cameras import UNKNOWN, told_cameras
 from mambaloc.importing.formats.parsing import as_numbers, folder_name, pictures_beside, read_text
 from mambaloc.importing.formats.timing import stamps_of
 
-SPLITS: Mapping[str, str] = {"mapping": "train", "validation": "val", "query": "test"}
+SPLITS: Mapping[str, Split] = {"mapping": "train", "validation": "val", "query": "test"}
 """What frames are for, by the name of their kapture's folder, or of the first folder of their path."""
 
 _FIRST_LINE = "# kapture format:"
@@ -71,10 +72,10 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
     parts = _parts(source)
     if not parts:
         raise InputError(f"{source}: holds no sensors/sensors.txt of kapture; give a folder that does")
-    posed: list[Posed] = []
-    lenses: list[tuple[str, ...] | None] = []
-    stamps: list[str] = []
-    missing, beside, choices = [], [], {}
+    frames: list[tuple[Key, Posed, tuple[str, ...] | None]] = []
+    missing: list[str] = []
+    beside: list[Path] = []
+    choices: dict[str, str] = {}
     for part, split in parts:
         checked, records = _records(part, split)
         root = images or part / "sensors/records_data"
@@ -89,12 +90,13 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
                 continue
             pose = np.linalg.inv(record.sensor_from_device @ checked.poses[record.row])
             fault = checked.faults.get(record.row, "")
-            posed.append(Posed(file, _sequence(file, root), pose, split=record.split, fault=fault))
-            lenses.append(_told(sensors, record))
-            stamps.append(str(record.key[0]))
+            told = Posed(file, _sequence(file, root), pose, split=record.split, fault=fault)
+            frames.append((record.key, told, _told(sensors, record)))
         choices |= {**found.choices, **checked.choices}
-    names, cameras = told_cameras(lenses)
-    times_s = _times_s(stamps)
+    if len({key for key, _, _ in frames}) == len(frames):  # parts of one recording; others may count alike
+        frames.sort(key=lambda frame: frame[0])
+    names, cameras = told_cameras([lens for _, _, lens in frames])
+    times_s = _times_s([str(stamp) for (stamp, _), _, _ in frames])
     if None in names and any(names):
         choices["cameras"] = f"none: some pictures are of an {UNKNOWN}"
     return build_capture(
@@ -102,7 +104,7 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
         source,
         [
             replace(each, camera=name if cameras else None, time_s=time_s)
-            for each, name, time_s in zip(posed, names, times_s, strict=True)
+            for (_, each, _), name, time_s in zip(frames, names, times_s, strict=True)
         ],
         unit="unknown",
         choices={**_CHOICES, **choices},
@@ -112,7 +114,7 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
     )
 
 
-def _parts(source: Path) -> list[tuple[Path, str | None]]:
+def _parts(source: Path) -> list[tuple[Path, Split | None]]:
     """Folders that hold ``sensors``, and what their frames are for."""
     if _is_part(source):
         return [(source, SPLITS.get(folder_name(source)))]
@@ -160,7 +162,7 @@ def _transforms(path: Path) -> tuple[list[list[str]], Checked]:
     return names, from_quaternions(table[:, 4:], table[:, :4], lambda row: places[row])
 
 
-def _records(part: Path, split: str | None) -> tuple[Checked, list[_Record]]:
+def _records(part: Path, split: Split | None) -> tuple[Checked, list[_Record]]:
     """Poses of a kapture, and its images."""
     sensors = part / "sensors"
     names, checked = _transforms(sensors / "trajectories.txt")

@@ -10,6 +10,7 @@ whose pixels count from the centre of the top-left one, as ``correct_intrinsic_s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,8 @@ def read_map_free(source: Path, images: Path | None = None) -> Capture:
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     lenses = cameras_by_picture(source / _INTRINSICS)
     has_lens = all(table.words[row] in lenses for row in there)
-    names, cameras = told_apart([lenses[table.words[row]] for row in there]) if has_lens else ([None] * len(there), {})
+    names, cameras = told_apart([lenses[table.words[row]] for row in there] if has_lens else [])
+    camera_of: Sequence[str | None] = names or [None] * len(there)
     posed = [
         Posed(
             found.files[row],
@@ -69,7 +71,7 @@ def read_map_free(source: Path, images: Path | None = None) -> Capture:
             camera,
             fault=checked.faults.get(row, ""),
         )
-        for row, camera in zip(there, names, strict=True)
+        for row, camera in zip(there, camera_of, strict=True)
     ]
     unread = [name for name in _UNREAD if (source / name).is_file()]
     return build_capture(

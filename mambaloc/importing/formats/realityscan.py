@@ -143,7 +143,7 @@ def _rows(path: Path) -> list[Row]:
 
 def _world_from_cam(table: Matrices) -> Matrices:
     """Poses (N, 4, 4) of rows of numbers; NaN where a position or an angle is not finite."""
-    is_lost = ~np.isfinite(table[:, :6]).all(axis=1)
+    is_lost = np.asarray(~np.isfinite(table[:, :6]).all(axis=1))
     heading, pitch, roll = np.where(is_lost[:, None], 0.0, table[:, 3:6]).T
     rotation = Rotation.from_euler("ZXY", np.stack((-heading, pitch, roll), axis=1), degrees=True).as_matrix()
     poses = rigid_transforms(rotation, table[:, :3]) @ OPENCV_FROM_OPENGL

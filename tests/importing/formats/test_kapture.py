@@ -73,6 +73,9 @@ def test_a_dataset_of_mapping_and_query_is_a_split(walk, cam_from_world, tmp_pat
     assert capture.split == ("train",) * 8 + ("test",) * 4
     np.testing.assert_allclose(capture.world_from_cam, walk.world_from_cam, atol=1e-6)
     assert len(capture.cameras) == 1
+    write_part(tmp_path / "query", walk, [8, 9, 10, 11], cam_from_world, stamps=["7", "8", "9", "10"])
+    write_part(tmp_path / "mapping", walk, range(8), cam_from_world, stamps=["0", "2", "4", "6", "1", "3", "5", "11"])
+    assert read_capture(tmp_path).split == ("train",) * 7 + ("test",) * 4 + ("train",)  # in the order of one recording
     assert read_capture(tmp_path / "query").split == ("test",) * 4
 
 
