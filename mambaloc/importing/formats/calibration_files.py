@@ -1,8 +1,8 @@
 """Calibration files of the layout of DSAC* and ACE, in which Wayspots are: ``calibration/X.txt`` beside ``rgb/X.jpg``.
 
 A file has a focal length in pixels, with the principal point in the picture's middle, or a 3x3 matrix. Files and
-pictures belong together in their order. Pixels count from the image's corner: the loader scales the principal point as it does
-the focal length. Source: ``dataset.py`` of github.com/nianticlabs/ace (Brachmann et al. 2023).
+pictures belong together in their order. Pixels count from the image's corner: the loader scales the principal point as
+it does the focal length. Source: ``dataset.py`` of github.com/nianticlabs/ace (Brachmann et al. 2023).
 """
 
 from __future__ import annotations

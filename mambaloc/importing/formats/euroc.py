@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.files import read_yaml
+from mambaloc.files import parse_yaml
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole, validate_se3
 from mambaloc.importing.formats.finding import find_pictures
@@ -36,6 +36,8 @@ _LENSES = {
     "equidistant": (opencv_fisheye, (4,)),
 }
 """How rays are distorted, by the file's word, with how many coefficients."""
+_OPENCVS_DIRECTIVE = "%YAML:1.0"
+"""Which its ``FileStorage`` begins with, and YAML spells with a space."""
 _NO_LENS = (None, "none", "None", "")
 _CHOICES = {
     "axes": "OpenCV camera axes: the ground truth's body, turned and shifted to the camera by T_BS of its sensor.yaml",
@@ -146,7 +148,8 @@ def _poses(path: Path) -> Table:
 
 
 def _sensor(path: Path) -> Mapping[str, Any]:
-    content = read_yaml(path, "it holds the calibration of a sensor", "give the recording's own")
+    text = read_text(path, "the calibration of a sensor").removeprefix(_OPENCVS_DIRECTIVE)
+    content = parse_yaml(text, path, "give the recording's own")
     if not isinstance(content, Mapping):
         raise InputError(f"{path}: holds no calibration of a sensor; give the recording's own")
     return content
