@@ -16,6 +16,7 @@ _MODULES = {
     "export": ("export", "write a bundle for apps"),
     "verify": ("verify_bundle", "replay a bundle's frames through its models"),
     "demo": ("demo", "localise in a browser"),
+    "serve": ("serve", "localise over HTTP"),
     "visualize": ("visualize", "draw figures of a trained system"),
     "download": ("download", "get a public dataset from its official address"),
     "render": ("render_scene", "render a scene"),

@@ -1,0 +1,263 @@
+"""An HTTP server of poses: a picture in the body, JSON out; built on Starlette and Uvicorn."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import math
+import socket
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from starlette.applications import Starlette
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+from starlette.formparsers import MultiPartException, MultiPartParser
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from mambaloc.errors import InputError
+from mambaloc.serving.workers import Answer, Task, WorkerLostError, Workers
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+"""Hosts that only this machine reaches."""
+
+_BODY_S = 30.0  # in which a body must have come
+_MULTIPART = "multipart/form-data"
+
+_Matrix = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the server takes.
+
+    Args:
+        body_bytes: of a request, whatever its headers say.
+        pictures: of a request.
+        waiting: pictures that are localised or wait for it, beyond which requests are turned away with status 503.
+    """
+
+    body_bytes: int = 32 * 2**20
+    pictures: int = 32
+    waiting: int = 256
+
+
+class _Metrics:
+    """What Prometheus is told."""
+
+    def __init__(self, workers: Workers) -> None:
+        self.registry = CollectorRegistry()
+        told: dict[str, Any] = {"registry": self.registry, "namespace": "mambaloc"}
+        self.requests = Counter("requests", "Requests to localise, by bundle and status", ("bundle", "status"), **told)
+        self.pictures = Counter("pictures", "Pictures, by bundle and what answered", ("bundle", "source"), **told)
+        self.seconds = Histogram("picture_seconds", "Of a picture, waiting included", ("bundle",), **told)
+        self.waiting = Gauge("pictures_waiting", "Pictures that are localised or wait for it", **told)
+        Gauge("workers", "Worker processes", **told).set(workers.count)
+        replaced = Gauge("workers_replaced", "Workers that died or took too long", **told)
+        replaced.set_function(lambda: workers.replaced)
+
+
+class _Endpoints:
+    def __init__(self, workers: Workers, limits: Limits, token: str | None) -> None:
+        self.workers, self.limits, self.token = workers, limits, token
+        self.metrics = _Metrics(workers)
+        self.waiting = 0
+
+    async def localise(self, request: Request) -> Response:
+        """One picture, as the body; or several, as the files of a form, which are answered in their order."""
+        name = request.path_params.get("bundle") or next(iter(self.workers.scenes))
+        try:
+            response = JSONResponse(await self._answers(request, name))
+        except HTTPException as error:
+            response = await told(request, error)
+        known = name if name in self.workers.scenes else ""
+        self.metrics.requests.labels(known, response.status_code).inc()
+        return response
+
+    async def health(self, request: Request) -> Response:
+        """What is served."""
+        return JSONResponse({"status": "ok", "bundles": self.workers.scenes, "workers": self.workers.count})
+
+    async def prometheus(self, request: Request) -> Response:
+        """Figures in Prometheus' format."""
+        self._check_token(request)
+        return Response(generate_latest(self.metrics.registry), media_type=CONTENT_TYPE_LATEST)
+
+    async def _answers(self, request: Request, name: str) -> Any:
+        self._check_token(request)
+        if name not in self.workers.scenes:
+            raise HTTPException(
+                404, f"bundle {name[:80]}: is not served. Choose one of {', '.join(self.workers.scenes)}."
+            )
+        if len(self.workers.scenes) > 1 and "bundle" not in request.path_params:
+            names = ", ".join(f"/localize/{each}" for each in self.workers.scenes)
+            raise HTTPException(404, f"/localize: several bundles are served. Choose one of {names}.")
+        intrinsics = _intrinsics(request.query_params.get("intrinsics"))
+        is_form = request.headers.get("content-type", "").startswith(_MULTIPART)
+        pictures = await _within(_BODY_S, self._pictures(request, is_form))
+        if self.waiting + len(pictures) > self.limits.waiting:
+            raise HTTPException(503, f"{self.waiting} pictures wait already. Try again later.", {"Retry-After": "1"})
+        answers = await asyncio.gather(*(self._localised(Task(name, each, intrinsics)) for each in pictures))
+        if is_form:
+            return {"pictures": answers}
+        if rule := answers[0].get("error"):
+            raise HTTPException(422, rule)
+        return answers[0]
+
+    async def _pictures(self, request: Request, is_form: bool) -> list[bytes]:
+        if not is_form:
+            return [b"".join([chunk async for chunk in self._limited(request)])]
+        # The form's fields are files of any name; others are refused.
+        parser = MultiPartParser(request.headers, self._limited(request), max_files=self.limits.pictures, max_fields=0)
+        try:
+            form = await parser.parse()
+        except (MultiPartException, KeyError) as error:
+            rule = getattr(error, "message", "no boundary is named")
+            raise HTTPException(400, f"body: is no form of at most {self.limits.pictures} files ({rule}).") from None
+        files = [file for _, file in form.multi_items() if isinstance(file, UploadFile)]
+        if not files:
+            raise HTTPException(400, "body: the form holds no file. Give a picture for each field.")
+        try:
+            return [await file.read() for file in files]
+        finally:
+            await form.close()
+
+    async def _limited(self, request: Request) -> AsyncGenerator[bytes, None]:
+        """The body in parts, until it is larger than may be; its headers may say anything."""
+        size = 0
+        async for chunk in request.stream():
+            size += len(chunk)
+            if size > self.limits.body_bytes:
+                most = self.limits.body_bytes / 2**20
+                raise HTTPException(413, f"body: is larger than {most:g} MiB. Give smaller pictures, or fewer.")
+            yield chunk
+
+    async def _localised(self, task: Task) -> Answer:
+        began = time.perf_counter()
+        self.waiting += 1
+        self.metrics.waiting.set(self.waiting)
+        try:
+            answer = await self.workers.localise(task)
+        except WorkerLostError:
+            raise HTTPException(500, "picture: no worker could localise it. Report it, with the picture.") from None
+        finally:
+            self.waiting -= 1
+            self.metrics.waiting.set(self.waiting)
+        source = "error" if "error" in answer else answer["source"] or "none"
+        self.metrics.pictures.labels(task.bundle, source).inc()
+        self.metrics.seconds.labels(task.bundle).observe(time.perf_counter() - began)
+        return answer
+
+    def _check_token(self, request: Request) -> None:
+        given = request.headers.get("authorization", "").removeprefix("Bearer ")
+        if self.token is not None and not hmac.compare_digest(given.encode(), self.token.encode()):
+            raise HTTPException(401, "Authorization: give Bearer and the token.", {"WWW-Authenticate": "Bearer"})
+
+
+def create_app(workers: Workers, limits: Limits | None = None, token: str | None = None, host: str = "*") -> Starlette:
+    """Make the application, for any ASGI server of one process.
+
+    Args:
+        workers: not yet started; they are started and stopped with the application.
+        limits: of requests.
+        token: that requests must carry, ``Authorization: Bearer TOKEN``; ``/health`` needs none.
+        host: where it is served; on a loopback address, requests for another host are refused, so that no page of
+            another site reaches it.
+    """
+    endpoints = _Endpoints(workers, limits or Limits(), token)
+
+    @asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        await workers.start()
+        try:
+            yield
+        finally:
+            workers.stop()
+
+    hosts = ["127.0.0.1", "localhost", "[::1]"] if host in LOOPBACK else ["*"]
+    return Starlette(
+        routes=[
+            Route("/localize", endpoints.localise, methods=["POST"]),
+            Route("/localize/{bundle}", endpoints.localise, methods=["POST"]),
+            Route("/health", endpoints.health),
+            Route("/metrics", endpoints.prometheus),
+        ],
+        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)],
+        exception_handlers={HTTPException: told},  # type: ignore[dict-item]
+        lifespan=lifespan,
+    )
+
+
+def serve_bundles(
+    bundles: Mapping[str, Path],
+    host: str,
+    port: int,
+    count: int,
+    limits: Limits | None = None,
+    token: str | None = None,
+) -> None:
+    """Serve until Ctrl-C or the process is asked to end; requests in hand are answered first.
+
+    Args:
+        bundles: by name.
+        host: address to listen at.
+        port: 0 takes a free one.
+        count: of worker processes.
+        limits: of requests.
+        token: that requests must carry.
+
+    Raises:
+        InputError: for a bundle that cannot be served, an address that cannot be listened at, or no token where others
+            than this machine reach the server.
+    """
+    if token is None and host not in LOOPBACK:
+        raise InputError(f"--host {host}: others may reach it, so a token is needed. Give --token-file FILE.")
+    workers = Workers(bundles, count)
+    try:
+        listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except (OSError, OverflowError) as error:
+        raise InputError(f"--host {host} --port {port}: cannot be listened at ({error}). Choose others.") from None
+    app = create_app(workers, limits, token, host)
+    config = uvicorn.Config(app, log_level="warning", lifespan="on", server_header=False, timeout_keep_alive=30)
+    with listening:
+        shown = f"[{host}]" if ":" in host else host
+        for name, scene in workers.scenes.items():
+            print(f"http://{shown}:{listening.getsockname()[1]}/localize/{name}  ({scene})")
+        print(f"{count} workers; /health, /metrics; Ctrl-C ends", flush=True)
+        uvicorn.Server(config).run(sockets=[listening])
+
+
+async def told(request: Request, error: HTTPException) -> JSONResponse:
+    """A mistake as JSON."""
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+
+
+async def _within(seconds: float, coming: Any) -> Any:
+    try:
+        return await asyncio.wait_for(coming, seconds)
+    except TimeoutError:
+        raise HTTPException(408, f"body: did not come within {seconds:g} s.") from None
+    except ClientDisconnect:
+        raise HTTPException(400, "body: ended early.") from None
+
+
+def _intrinsics(text: str | None) -> _Matrix | None:
+    if text is None:
+        return None
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError:
+        raise HTTPException(400, "intrinsics: give FX,FY,CX,CY in pixels of the picture.") from None
+    if not all(map(math.isfinite, (fx, fy, cx, cy))):
+        raise HTTPException(400, "intrinsics: give finite numbers.")
+    return ((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))

@@ -1,0 +1,249 @@
+"""Processes that localise pictures. One that dies or hangs is replaced, and its picture is tried again.
+
+LitServe 0.2.19 and Ray Serve 2.56 were measured beside this (docs/serving.md): with the one, requests of a worker that
+is killed are never answered; with the other, an idle server takes 1.7 GiB.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from mambaloc.errors import InputError
+from mambaloc.images import decode_image
+from mambaloc.runtime import Localiser
+from mambaloc.runtime.localisation import Localisation
+
+_TRIES = 3
+_START_S = 120.0
+_ENVIRONMENT = {  # of a worker: it has a core, and the memory of pictures that cameras take
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+    "OPENCV_IO_MAX_IMAGE_PIXELS": str(100_000_000),
+}
+
+Answer = dict[str, Any]
+"""What is said of a picture, ready for JSON: its pose, or ``error``, the rule that it breaks."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A picture to localise.
+
+    Args:
+        bundle: name of the bundle.
+        picture: an encoded picture: JPEG, PNG and what else :func:`~mambaloc.images.decode_image` takes.
+        intrinsics: (3, 3) pinhole matrix in its pixels; the training camera's unless given.
+    """
+
+    bundle: str
+    picture: bytes
+    intrinsics: tuple[tuple[float, ...], ...] | None = None
+
+
+class WorkerLostError(Exception):
+    """A worker died, or took too long, with a task in hand."""
+
+
+class Workers:
+    """Worker processes, each with every bundle loaded.
+
+    Args:
+        bundles: folders, or other models that :class:`~mambaloc.runtime.Localiser` takes, by name.
+        count: how many processes.
+        seconds: that a picture may take before its worker is replaced.
+
+    Raises:
+        InputError: for a bundle that cannot be served.
+
+    Attributes:
+        scenes: what each bundle knows, by the bundle's name.
+        replaced: how many workers were replaced.
+    """
+
+    def __init__(self, bundles: Mapping[str, Path], count: int, seconds: float = 30.0) -> None:
+        self.scenes = {name: Localiser(path, threads=1).scene for name, path in bundles.items()}
+        self.count, self.replaced = count, 0
+        self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
+        self._workers = [_Worker(bundles, seconds) for _ in range(count)]
+        self._idle: asyncio.Queue[_Worker] = asyncio.Queue()
+
+    async def start(self) -> None:
+        """Start all, and wait until they can localise.
+
+        Raises:
+            InputError: where one does not start.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            await asyncio.gather(*(loop.run_in_executor(self._threads, each.start) for each in self._workers))
+        except WorkerLostError:
+            self.stop()
+            raise InputError(
+                "--workers: a worker process does not start. Free some memory, or ask for fewer."
+            ) from None
+        for worker in self._workers:
+            self._idle.put_nowait(worker)
+
+    def stop(self) -> None:
+        """End all processes."""
+        for worker in self._workers:
+            worker.stop()
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def localise(self, task: Task) -> Answer:
+        """Localise a picture on the worker that is idle next.
+
+        Raises:
+            WorkerLostError: where several workers, one after another, were lost with it.
+        """
+        loop = asyncio.get_running_loop()
+        for left in reversed(range(_TRIES)):
+            worker = await self._idle.get()
+            try:
+                answer = await loop.run_in_executor(self._threads, worker.ask, task)
+            except WorkerLostError:
+                self.replaced += 1
+                loop.run_in_executor(self._threads, self._replace, worker, loop)
+                if not left:
+                    raise
+            else:
+                self._idle.put_nowait(worker)
+                return answer
+        raise AssertionError("unreachable")
+
+    def _replace(self, worker: _Worker, loop: asyncio.AbstractEventLoop) -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            while not worker.is_stopped:
+                try:
+                    worker.start()
+                except WorkerLostError:  # killed while it started
+                    continue
+                loop.call_soon_threadsafe(self._idle.put_nowait, worker)
+                return
+
+
+class _Worker:
+    """A process, and the pipe to it; used by one thread at a time."""
+
+    def __init__(self, bundles: Mapping[str, Path], seconds: float) -> None:
+        self.bundles, self.seconds, self.is_stopped = dict(bundles), seconds, False
+        self.process: Any = None
+        self.pipe: Connection | None = None
+
+    def start(self) -> None:
+        """Start the process, and wait until its bundles are loaded."""
+        context = get_context("spawn")  # a fork would copy the server's threads and sockets
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs, self.bundles), daemon=True)
+        with _environment(_ENVIRONMENT):
+            self.process.start()
+        theirs.close()  # so that the end of the process ends the pipe
+        self._receive(_START_S)
+
+    def ask(self, task: Task) -> Answer:
+        """Have a task done."""
+        assert self.pipe is not None
+        try:
+            self.pipe.send(task)
+        except OSError:
+            raise self._lost() from None
+        return self._receive(self.seconds)
+
+    def stop(self) -> None:
+        """End the process."""
+        self.is_stopped = True
+        if self.process is not None:
+            self._lost()
+
+    def _receive(self, seconds: float) -> Answer:
+        assert self.pipe is not None
+        try:
+            if self.pipe.poll(seconds):
+                return self.pipe.recv()
+        except (OSError, EOFError):
+            pass
+        raise self._lost()
+
+    def _lost(self) -> WorkerLostError:
+        self.process.kill()
+        self.process.join()
+        return WorkerLostError(f"worker {self.process.pid}: died, or took over {self.seconds:g} s")
+
+
+_starting = threading.Lock()
+
+
+@contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Give a process that is started its environment; ``multiprocessing`` has no option for it."""
+    with _starting:
+        before = {name: os.environ.get(name) for name in variables}
+        os.environ.update(variables)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _work(pipe: Connection, bundles: Mapping[str, Path]) -> None:
+    """What a worker does: answer tasks, one after another, until the server ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the server's
+    warnings.simplefilter("always")
+    localisers = {name: Localiser(path, threads=1) for name, path in bundles.items()}
+    with suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        pipe.send({})
+        while True:
+            task = pipe.recv()
+            pipe.send(_answer(localisers[task.bundle], task))
+    sys.exit()
+
+
+def _answer(localiser: Localiser, task: Task) -> Answer:
+    image = decode_image(task.picture)
+    if isinstance(image, str):
+        return {"error": image}
+    with warnings.catch_warnings(record=True) as told:
+        try:
+            found = localiser.localise(image, task.intrinsics)
+        except InputError as error:
+            return {"error": str(error)}
+    answer = {"bundle": task.bundle, "scene": localiser.scene, **pose_of(found)}
+    return answer | ({"warnings": [str(each.message) for each in told]} if told else {})
+
+
+def pose_of(found: Localisation) -> Answer:
+    """A localisation for JSON; null where nothing is known."""
+    covariance = None if found.covariance is None else found.covariance.tolist()
+    return {
+        "position_m": _finite(found.position_m.tolist()),
+        "quaternion_wxyz": _finite(found.quaternion.tolist()),
+        "position_radius_m": found.position_radius_m,
+        "rotation_radius_deg": found.rotation_radius_deg,
+        "unfamiliarity": found.unfamiliarity,
+        "source": found.source,
+        "is_accepted": found.is_accepted,
+        "is_unfamiliar": found.is_unfamiliar,
+        "inliers": found.inliers,
+        "covariance": covariance,
+        "latency_ms": round(1000 * found.latency_s, 3),
+    }
+
+
+def _finite(values: list[float]) -> list[float] | None:
+    return values if all(map(math.isfinite, values)) else None
