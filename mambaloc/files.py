@@ -43,16 +43,25 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
     Raises:
         InputError: in either case.
     """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no YAML ({error}); {broken}") from None
+    return parse_yaml(text, path, broken)
+
+
+def parse_yaml(text: str, path: Path, broken: str) -> Any:
+    """Plain data of a YAML file's text; the arguments and errors are those of :func:`read_yaml`."""
     import yaml  # only here: exported models run without it
 
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+        data = yaml.safe_load(text)
         if _expanded(data, {}) > _MOST_VALUES:
             raise InputError(f"{path}: its aliases stand for more than {_MOST_VALUES} values; write them out")
         return data
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a ValueError: a number too long, or no date
         raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); {broken}") from None
 
 

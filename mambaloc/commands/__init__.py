@@ -11,6 +11,7 @@ _MODULES = {
     "train": ("train", "train a recipe"),
     "evaluate": ("evaluate", "measure a checkpoint on test frames"),
     "import": ("import_scene", "make a scene of a capture"),
+    "export-scene": ("export_scene", "write an imported scene as kapture"),
     "map": ("map", "build a sparse map, or change one"),
     "localize": ("localize", "localise pictures, a film or a camera"),
     "export": ("export", "write a bundle for apps"),

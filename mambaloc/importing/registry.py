@@ -13,11 +13,16 @@ from mambaloc.importing.formats import (
     arkit,
     colmap,
     csv_table,
+    euroc,
+    kapture,
     kitti,
+    map_free,
+    metashape,
     nerfstudio,
     pose_files,
     pose_folders,
     pose_lines,
+    realityscan,
     seven_scenes,
     stray_scanner,
     tum,
@@ -56,6 +61,13 @@ FORMATS: dict[str, Format] = {
         stray_scanner.is_stray_scanner,
         stray_scanner.read_stray_scanner,
     ),
+    "euroc": Format("mav0/cam0 and mav0/state_groundtruth_estimate0 of EuRoC", euroc.is_euroc, euroc.read_euroc, True),
+    "kapture": Format(
+        "sensors/ with sensors.txt, records_camera.txt and trajectories.txt of kapture",
+        kapture.is_kapture,
+        kapture.read_kapture,
+        True,
+    ),
     "tum_rgbd": Format("rgb.txt and groundtruth.txt", tum.is_tum_rgbd, tum.read_tum_rgbd, True),
     "kitti": Format("poses/ and sequences/", kitti.is_kitti, kitti.read_kitti),
     "7scenes": Format(
@@ -63,9 +75,24 @@ FORMATS: dict[str, Format] = {
         seven_scenes.is_seven_scenes,
         seven_scenes.read_seven_scenes,
     ),
+    "map_free": Format(
+        "poses.txt and intrinsics.txt of Map-free, with a picture's name in each line",
+        map_free.is_map_free,
+        map_free.read_map_free,
+        True,
+    ),
     "scannet": Format("color/ and pose/", pose_folders.is_scannet, pose_folders.read_scannet),
     "replica": Format("traj.txt and results/", pose_folders.is_replica, pose_folders.read_replica),
     "colmap": Format("cameras, images and points3D", colmap.is_colmap, colmap.read_colmap, True),
+    "metashape": Format(
+        "cameras.xml, exported by Agisoft Metashape", metashape.is_metashape, metashape.read_metashape, True
+    ),
+    "realityscan": Format(
+        "a .csv with columns name,x,y,alt,heading,pitch,roll,f of RealityScan or RealityCapture",
+        realityscan.is_realityscan,
+        realityscan.read_realityscan,
+        True,
+    ),
     "csv": Format("a .csv with columns image,x,y,z,qw,qx,qy,qz", csv_table.is_csv, csv_table.read_csv, True),
     "csv_world_from_cam": Format(
         "the same", _by_name_alone, partial(csv_table.read_csv, direction="world_from_cam"), True

@@ -28,6 +28,15 @@ EYE16 = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 LENS = {"w": 6, "h": 4, "fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0}
 KEYFRAME = {f"t_{i}{j}": float(i == j) for i in range(3) for j in range(4)} | LENS | {"width": 6, "height": 4}
 METADATA = {"poses": [[0, 0, 0, 1, k, 0, 0] for k in range(2)], "K": [5, 0, 0, 0, 5, 0, 3, 2, 1], "w": 6, "h": 4}
+SENSOR = f"T_BS: {{data: {np.eye(4).ravel().tolist()}}}\nresolution: [6, 4]\nintrinsics: [5, 5, 3, 2]\n"
+SHOT = '<camera id="{0}" sensor_id="0" component_id="0" label="{0}"><transform>' + EYE16.replace("\n", " ")
+METASHAPE = (
+    '<document><chunk><sensors><sensor id="0" type="frame"><resolution width="6" height="4"/><calibration><f>5</f>'
+    '<k1>0.1</k1></calibration></sensor></sensors><components><component id="0"><transform><rotation>1 0 0 0 1 0 0 0 1'
+    "</rotation><translation>0 0 0</translation><scale>2</scale></transform></component></components><cameras>"
+    + "".join(f"{SHOT.format(k)}</transform></camera>" for k in (1, 2))
+    + "</cameras></chunk></document>"
+)
 HEADER = "scene,split,image,x,y,z,qw,qx,qy,qz,time\n"
 
 # Files of a small whole source of each format, and which of them is damaged.
@@ -36,6 +45,32 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
         {"rgb.txt": "1.0 rgb/1.png\n2.0 rgb/2.png\n", "groundtruth.txt": "1.01 0 0 0 0 0 0 1\n1.99 1 0 0 0 0 0 1\n"}
         | {f"rgb/{k}.png": PICTURE for k in (1, 2)},
         ("rgb.txt", "groundtruth.txt"),
+    ),
+    "euroc": (
+        {
+            "mav0/cam0/data.csv": "#timestamp [ns],filename\n1000000000,1.png\n2000000000,2.png\n",
+            "mav0/cam0/sensor.yaml": SENSOR
+            + "distortion_model: radial-tangential\ndistortion_coefficients: [0.1, 0, 0, 0]\n",
+            "mav0/state_groundtruth_estimate0/data.csv": "1000000000,0,0,0,1,0,0,0\n2000000000,1,0,0,1,0,0,0\n",
+            "mav0/state_groundtruth_estimate0/sensor.yaml": SENSOR,
+        }
+        | {f"mav0/cam0/data/{k}.png": PICTURE for k in (1, 2)},
+        (
+            "mav0/cam0/data.csv",
+            "mav0/cam0/sensor.yaml",
+            "mav0/state_groundtruth_estimate0/data.csv",
+            "mav0/state_groundtruth_estimate0/sensor.yaml",
+        ),
+    ),
+    "kapture": (
+        {
+            "sensors/sensors.txt": "# kapture format: 1.1\ncam0, , camera, SIMPLE_RADIAL, 6, 4, 5, 3, 2, 0.1\n",
+            "sensors/records_camera.txt": "0, cam0, 1.png\n1, cam0, 2.png\n",
+            "sensors/trajectories.txt": "0, rig, 1, 0, 0, 0, 0, 0, 0\n1, cam0, 1, 0, 0, 0, 1, 0, 0\n",
+            "sensors/rigs.txt": "rig, cam0, 1, 0, 0, 0, 0, 0, 0\n",
+        }
+        | {f"sensors/records_data/{k}.png": PICTURE for k in (1, 2)},
+        tuple(f"sensors/{name}.txt" for name in ("sensors", "records_camera", "trajectories", "rigs")),
     ),
     "tum": ({"a.tum": "1.0 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", "1.0.png": PICTURE, "2.png": PICTURE}, ("a.tum",)),
     "kitti": (
@@ -55,6 +90,12 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
         | {"seq-01/frame-000000.depth.png": DEPTH},
         ("TrainSplit.txt", "seq-01/frame-000000.pose.txt", "seq-01/frame-000000.depth.png", "camera-intrinsics.txt"),
     ),
+    "map_free": (
+        {"poses.txt": "seq0/1.png 1 0 0 0 0 0 0\nseq1/2.png 1 0 0 0 1 0 0\n"}
+        | {"intrinsics.txt": "seq0/1.png 5 5 3 2 6 4\nseq1/2.png 5 5 3 2 6 4\n"}
+        | {f"seq{k - 1}/{k}.png": PICTURE for k in (1, 2)},
+        ("poses.txt", "intrinsics.txt"),
+    ),
     "scannet": (
         {f"color/{k}.png": PICTURE for k in (1, 2)}
         | {f"pose/{k}.txt": EYE16 for k in (1, 2)}
@@ -72,14 +113,25 @@ SOURCES: dict[str, tuple[dict[str, str | bytes], tuple[str, ...]]] = {
         | {f"keyframes/cameras/{k}.json": json.dumps(KEYFRAME) for k in (1, 2)},
         ("keyframes/cameras/1.json",),
     ),
+    "metashape": ({"a.xml": METASHAPE} | {f"{k}.png": PICTURE for k in (1, 2)}, ("a.xml",)),
+    "realityscan": (
+        {
+            "a.csv": "#name,x,y,alt,heading,pitch,roll,f,px,k1,t1\n1.png,0,0,0,9,80,-9,30,0,0.1,0\n"
+            "2.png,1,0,0,0,90,0,30,0,0,0\n"
+        }
+        | {f"{k}.png": PICTURE for k in (1, 2)},
+        ("a.csv",),
+    ),
     "pose_lines": (
         {"a.txt": "1.png 1 0 0 0 0 0 0\n2.png 1 0 0 0 1 0 0\n", "1.png": PICTURE, "2.png": PICTURE}
         | {"intrinsics.txt": "1.png 5 5 3 2 6 4\n2.png 5 5 3 2 6 4\n"},
         ("a.txt", "intrinsics.txt"),
     ),
     "pose_files": (
-        {f"{k}.color.png": PICTURE for k in (1, 2)} | {f"{k}.pose.txt": EYE16 for k in (1, 2)},
-        ("1.pose.txt", "1.color.png"),
+        {f"train/rgb/{k}.color.png": PICTURE for k in (1, 2)}
+        | {f"train/poses/{k}.pose.txt": EYE16 for k in (1, 2)}
+        | {"train/calibration/1.txt": "5.0\n", "train/calibration/2.txt": "5 0 3\n0 5 2\n0 0 1\n"},
+        ("train/poses/1.pose.txt", "train/rgb/1.color.png", "train/calibration/1.txt", "train/calibration/2.txt"),
     ),
     "csv": (
         {"a.csv": HEADER + "den,train,1.png,0,0,0,1,0,0,0,1\nden,test,2.png,1,0,0,1,0,0,0,2\n"}

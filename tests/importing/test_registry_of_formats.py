@@ -20,6 +20,13 @@ FILES = {
         "depth/000000.png",
         "confidence/000000.png",
     ],
+    "euroc": [
+        "mav0/cam0/data.csv",
+        "mav0/cam0/sensor.yaml",
+        "mav0/cam0/data/1.png",
+        "mav0/imu0/data.csv",
+        "mav0/state_groundtruth_estimate0/data.csv",
+    ],
     "tum_rgbd": ["rgb.txt", "depth.txt", "groundtruth.txt", "accelerometer.txt", "rgb/1.2.png"],
     "kitti": ["poses/00.txt", "sequences/00/image_2/000000.png", "sequences/00/calib.txt"],
     "7scenes": ["TrainSplit.txt", "TestSplit.txt", "seq-01/frame-000000.color.png", "seq-01/frame-000000.pose.txt"],
@@ -32,12 +39,30 @@ FILES = {
     "structure_from_motion": ["a.jpg", "b.jpg", "notes.txt"],
 }
 WRITTEN = {
+    "map_free": {
+        "seq1/1.jpg": "",
+        "poses.txt": "# name qw qx qy qz tx ty tz\nseq1/1.jpg 1 0 0 0 0 0 0\nseq1/2.jpg 0 0 0 0 0 0 0\n",
+        "poses_device.txt": "seq1/1.jpg 1 0 0 0 0 0 0\nseq1/2.jpg 1 0 0 0 1 0 0\n",
+        "intrinsics.txt": "seq1/1.jpg 5 5 3 2 6 4\n",
+    },
+    "kapture": {
+        "mapping/sensors/sensors.txt": "# kapture format: 1.1\n",
+        "mapping/sensors/records_camera.txt": "",
+        "mapping/sensors/trajectories.txt": "",
+        "mapping/sensors/records_data/a.jpg": "",
+    },
+    "realityscan": {
+        "photos/1.jpg": "",
+        "any.csv": "#cameras 1\n#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm\n1.jpg,0,0,0,0,0,0,30,0\n",
+    },
+    "metashape": {"photos/1.jpg": "", "export.xml": '<?xml version="1.0"?>\n<document version="2">\n<chunk></chunk>'},
     "pose_lines": {"images/1.jpg": "", "images/2.jpg": "", "any.log": f"{MATRIX}\n{MATRIX}\n"},
     "pose_files": {"1.color.png": "", "1.pose.txt": MATRIX, "seq-02/1.color.png": "", "seq-02/1.pose.txt": MATRIX},
     "tum": {"images/1.2.jpg": "", "path.txt": "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1 0\n"},
     "kitti_poses": {"images/1.jpg": "", "path.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2},
     "structure_from_motion": {
         "1.jpg": "",
+        "1.xml": "<annotation><object/></annotation>",
         "1.txt": "0 0.5 0.5 0.1 0.1\n",
         "intrinsics.txt": "500 0 320 0 500 240 0 0 1\n",
     },
@@ -46,6 +71,7 @@ WRITTEN = {
 ALSO = [
     ("record3d", ["metadata.json", "rgb/0.png"]),
     ("polycam", ["corrected_cameras/1.json", "corrected_images/1.jpg"]),
+    ("euroc", ["cam0/data.csv", "cam0/sensor.yaml", "mocap0/data.csv", "imu0/data.csv"]),
     ("scannet", ["frames/color/0.jpg", "frames/pose/0.txt"]),
     ("colmap", ["cameras.txt", "images.txt", "points3D.txt"]),
     ("colmap", ["sparse/images.txt", "images/a.jpg"]),

@@ -38,13 +38,14 @@ _MEND = "import the scene again"
 
 @dataclass(frozen=True)
 class Row:
-    """A row of ``frames.csv``, checked; ``pose`` is x, y, z, qw, qx, qy, qz."""
+    """A row of ``frames.csv``, checked; ``pose`` is x, y, z, qw, qx, qy, qz, ``time_s`` None where it has no time."""
 
     image: Path
     sequence: str
     pose: tuple[float, ...]
     camera: str
     split: str
+    time_s: float | None = None
 
 
 def scene_note(folder: Path) -> dict[str, Any]:
@@ -196,7 +197,7 @@ def _row(folder: Path, told: dict[str, str], where: str) -> Row:
         raise InputError(f"{where}: lies farther than {FARTHEST:g} from the origin; shift the world towards it")
     if abs(math.hypot(*pose[3:]) - 1) > UNIT_TOLERANCE:
         raise InputError(f"{where}: quaternion has length {math.hypot(*pose[3:]):.6g}, not 1; correct the row")
-    return Row(image, told["sequence"], pose, told["camera"], told["split"])
+    return Row(image, told["sequence"], pose, told["camera"], told["split"], values.get("time_s"))
 
 
 DATASET = Dataset(CAPTURE, read_split, {}, Path("scenes"), marks_validation=True)

@@ -81,7 +81,7 @@ def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
 def _camera(told: Mapping[str, Any], images: Sequence[Path], where: str) -> Camera:
     """A camera in pixels of the size that the file tells, or else of the first of its own images."""
     size = [number(told, key, where) for key in "wh"]
-    sides = [side for side in size if side] if all(size) else list(map(float, _first_size(images)))
+    sides = [side for side in size if side] if all(size) else list(map(float, first_size(images)))
     focal = [_focal(told, axis, sides[axis], where) for axis in (0, 1)]
     focal_px = (focal[0], focal[1]) if focal[0] and focal[1] else (focal[0] or focal[1],) * 2
     centre = [number(told, key, where) for key in ("cx", "cy")]
@@ -131,8 +131,12 @@ def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
     return replace(camera, distorted=lens, model=model)
 
 
-def _first_size(images: Sequence[Path]) -> tuple[int, int]:
-    """Width and height of the first image that can be decoded, as its file stores it."""
+def first_size(images: Sequence[Path]) -> tuple[int, int]:
+    """Width and height of the first image that can be decoded, as its file stores it.
+
+    Raises:
+        InputError: where none can be.
+    """
     reasons = []
     for path in images:
         try:

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +111,26 @@ def read_object(path: Path, holds: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise InputError(f"{path}: is no JSON object; it holds {holds}, export it again")
     return value
+
+
+def read_xml(path: Path, holds: str) -> ElementTree.Element:
+    """Read the root of an XML file; one that declares a document type, as entities need, is refused unread.
+
+    Raises:
+        InputError: where it cannot be read, or is none.
+    """
+    text = read_text(path, holds)
+
+    def refuse(*_: object) -> None:
+        raise InputError(f"{path}: declares a document type, which may hold entities; remove <!DOCTYPE ...>")
+
+    guard = expat.ParserCreate()
+    guard.StartDoctypeDeclHandler = refuse
+    try:
+        guard.Parse(text, True)
+        return ElementTree.fromstring(text)
+    except (expat.ExpatError, ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path}: is no XML ({error}); it holds {holds}, export it again") from None
 
 
 def array_of(

@@ -2,14 +2,14 @@
 
 ``frame-000012.color.png`` with ``frame-000012.pose.txt`` is the layout of 7-Scenes (Shotton et al. 2013), of 12-Scenes
 and of 3RScan: a 4x4 camera-to-world matrix in metres. ``X.jpg`` with ``X.txt``, ``X.pose.txt`` or ``X.npy``, and
-``rgb/X.png`` with ``poses/X.txt`` (DSAC*, Brachmann and Rother 2021), are read likewise, in an unknown unit: 4x4 or
-3x4, row after row, or column after column where only that gives rotations.
+``rgb/X.png`` with ``poses/X.txt`` (DSAC*, Brachmann and Rother 2021; Wayspots), are read likewise, in an unknown unit:
+4x4 or 3x4, row after row, or column after column where only that gives rotations.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,9 @@ from mambaloc.data.points.depth import INTRINSICS_FILE, depth_path, read_depth_i
 from mambaloc.errors import InputError
 from mambaloc.images import pictures, stored_size
 from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.formats.arkit import told_apart
 from mambaloc.importing.formats.builder import Checked, Matrices, Posed, build_capture, pinhole, validate_se3
+from mambaloc.importing.formats.calibration_files import calibrated
 from mambaloc.importing.formats.parsing import as_numbers, folder_name, number_of, read_text
 from mambaloc.importing.formats.pose_lines import Direction, towards_world
 from mambaloc.importing.formats.pose_rows import is_by_column, matrices_of
@@ -82,22 +84,22 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
     checked, by_column = _read_matrices(files)
     poses = towards_world(checked.poses, direction)
     is_layout = all(file.name.endswith(".pose.txt") for file in files)
-    camera = _official_camera(groups[0].pairs[0][0]) if is_layout else None
     images = [(group.name, image) for group in groups for image, _ in group.pairs]
+    names, cameras, said = _cameras(source, [image for _, image in images], is_layout)
     depth, depth_camera = _depth(source, [image for _, image in images]) if is_layout else ([None] * len(images), None)
     posed = [
         Posed(
             image,
             name,
             pose,
-            None if camera is None else "colour",
+            camera,
             split=_split(name),
             depth=each,
             fault=checked.faults.get(row, ""),
         )
-        for row, ((name, image), pose, each) in enumerate(zip(images, poses, depth, strict=True))
+        for row, ((name, image), pose, camera, each) in enumerate(zip(images, poses, names, depth, strict=True))
     ]
-    told = {"written": "column after column"} if by_column else {}
+    told = {**({"written": "column after column"} if by_column else {}), **({"cameras": said} if said else {})}
     unit = "metres, as 7-Scenes has them" if is_layout else "unknown: pose files do not tell"
     return build_capture(
         "pose_files",
@@ -113,7 +115,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
             **told,
             **checked.choices,
         },
-        cameras={} if camera is None else {"colour": camera},
+        cameras=cameras,
         missing=[file.name for group in groups for file in group.poses_alone],
         beside=[image for group in groups for image in group.beside],
         depth_camera=depth_camera,
@@ -223,6 +225,17 @@ def _read_matrices(files: list[Path]) -> tuple[Checked, bool]:
     table = np.stack(values)
     by_column = bool(is_by_column(table))
     return validate_se3(matrices_of(table, by_column), lambda row: str(files[row])), by_column
+
+
+def _cameras(source: Path, images: list[Path], is_layout: bool) -> tuple[Sequence[str | None], dict[str, Camera], str]:
+    """The name of each image's camera, cameras by name, and what was decided: by files, or that of 7-Scenes."""
+    found, said = calibrated(source, images)
+    if found:
+        return *told_apart([found[image] for image in images]), said
+    official = _official_camera(images[0]) if is_layout else None
+    return (
+        ([None] * len(images), {}, said) if official is None else (["colour"] * len(images), {"colour": official}, "")
+    )
 
 
 def _official_camera(image: Path) -> Camera | None:

@@ -2,9 +2,9 @@
 
 Sixteen numbers are a 4x4 matrix, camera-to-world; lines without a name are those of the pictures in natural order. A
 name may stand before twelve or sixteen numbers, or before seven: ``name qw qx qy qz tx ty tz`` is **world-to-camera**,
-scalar first, as in COLMAP's ``images.txt``, in hloc's results and in Map-free's ``poses.txt`` (Arnold et al. 2022,
-github.com/nianticlabs/map-free-reloc); with the position first, a line that names the columns must say where the scalar
-is, and poses are camera-to-world. ``intrinsics.txt`` with lines ``name fx fy cx cy width height`` is Map-free's.
+scalar first, as in COLMAP's ``images.txt`` and hloc's results; with the position first, a line that names the columns
+must say where the scalar is, and poses are camera-to-world. ``intrinsics.txt`` with lines ``name fx fy cx cy width
+height`` is Map-free's.
 """
 
 from __future__ import annotations
@@ -16,26 +16,19 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX, PICTURES, pictures
-from mambaloc.importing.capture import Camera, Capture
+from mambaloc.images import PICTURES, pictures
+from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import (
     Checked,
     Matrices,
     Posed,
     build_capture,
     from_quaternions,
-    pinhole,
     validate_se3,
 )
 from mambaloc.importing.formats.finding import count_there, find_pictures
-from mambaloc.importing.formats.parsing import (
-    Table,
-    as_numbers,
-    first_with_pictures,
-    folder_name,
-    pictures_beside,
-    read_lines,
-)
+from mambaloc.importing.formats.map_free import cameras_by_picture
+from mambaloc.importing.formats.parsing import Table, first_with_pictures, folder_name, pictures_beside
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS, Layout, layout_of, matrices_of, pose_files, read_rows
 from mambaloc.importing.formats.timing import pair
 
@@ -145,7 +138,7 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None, given: 
         told |= _by_column(layout)
     world_from_cam = towards_world(checked.poses, direction)
     rows, how, missing = _pictures_of(path, table, given)
-    cameras = _cameras(path.parent / "intrinsics.txt")
+    cameras = cameras_by_picture(path.parent / "intrinsics.txt")
     names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras.values()))}
     camera_of = {name: names[camera] for name, camera in cameras.items()}
     posed = [
@@ -221,17 +214,3 @@ def _sequence(image: Path, root: Path) -> str:
 
 def _by_column(layout: Layout) -> dict[str, str]:
     return {"matrices": "written column after column"} if layout.by_column else {}
-
-
-def _cameras(path: Path) -> dict[str, Camera]:
-    """Cameras by picture's name, of lines ``name fx fy cx cy width height``; none where the file is another."""
-    if not path.is_file():
-        return {}
-    found = {}
-    for line, (name, *words) in read_lines(path, "lines 'name fx fy cx cy width height'"):
-        values = as_numbers(words)
-        if values is None or len(values) != 6 or not np.isfinite(values).all():
-            return {}
-        fx, fy, cx, cy, width, height = values.tolist()
-        found[name] = pinhole((width, height), (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), f"{path}, line {line}")
-    return found

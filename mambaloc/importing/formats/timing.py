@@ -79,7 +79,7 @@ def _number(word: str) -> Decimal | None:
         number = Decimal(word) if "_" not in word else Decimal("nan")
     except InvalidOperation:
         return None
-    return number if number.is_finite() and abs(number) < _LARGEST_NS else None
+    return number if number.is_finite() and number.copy_abs() < _LARGEST_NS else None  # abs() may overflow
 
 
 def _possible(numbers: Sequence[Decimal]) -> list[str]:

@@ -136,7 +136,7 @@ def test_the_unit_of_times_since_1970_is_their_size(word, unit, ns):
     assert (stamps.unit, stamps.ns.tolist()) == (unit, [ns])
 
 
-@pytest.mark.parametrize("words", [["1_5"], ["nan", "1"], ["x"], ["1e99"], []])
+@pytest.mark.parametrize("words", [["1_5"], ["nan", "1"], ["x"], ["1e99"], ["1e1000000000"], []])
 def test_words_that_are_no_times(words):
     assert stamps_of(words) is None
 
