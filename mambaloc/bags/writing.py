@@ -108,8 +108,8 @@ def moved(
 ) -> tuple[Matrix, Matrix, Matrix]:
     """The pose of another frame on the same body, and its covariance.
 
-    A turn about the camera moves the body's origin, too: ``d body = d cam + d turn x arm``, where ``arm`` leads from the
-    camera to the body, in the world's axes.
+    A turn about the camera moves the body's origin, too: ``d body = d cam + d turn x arm``, where ``arm`` leads from
+    the camera to the body, in the world's axes.
 
     Args:
         position: of the camera, (3,).

@@ -1,8 +1,8 @@
 """Robots' recordings: ROS 1 bags (``.bag``) and ROS 2 bags (a folder, ``.mcap`` or ``.db3``), read by rosbags.
 
 A picture's time and its camera's optical frame are those of its message's header. That frame has OpenCV's axes, z
-forward, x right and y down (REP 103). It is placed by a topic of poses or by ``/tf``, whose transforms are interpolated at the
-picture's time; ``/tf_static`` links the robot to the camera.
+forward, x right and y down (REP 103). It is placed by a topic of poses or by ``/tf``, whose transforms are
+interpolated at the picture's time; ``/tf_static`` links the robot to the camera.
 """
 
 from __future__ import annotations
