@@ -1,0 +1,107 @@
+"""A drive in one bag, imported, trained on and localised into another: errors are those of evaluate.py."""
+
+from __future__ import annotations
+
+import csv
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_writing import FIRST_NS, messages, recorder
+from conftest import TINY_MAMBALOC, write_recipe
+from scipy.spatial.transform import Rotation, Slerp
+
+from mambaloc.bags.reading import is_bag
+from mambaloc.bags.writing import TOPIC
+from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render
+
+TOOLS = Path(__file__).parents[2] / "tools"
+SIZE, FRAMES, STEP_NS = (160, 120), 64, 100_000_000
+CAM, K = "camera_optical", default_intrinsics((160, 120))
+BASE_FROM_CAM = np.eye(4)
+BASE_FROM_CAM[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+BASE_FROM_CAM[:3, 3] = 0.3, 0.02, 0.5
+
+pytestmark = pytest.mark.slow
+
+
+def tool(name: str, *words: object) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [name, *map(str, words)])
+        runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
+
+
+def true_poses() -> np.ndarray:
+    """Of the camera at the pictures' times, by SciPy: poses of the base are halfway between these."""
+    base, when = base_poses(), np.arange(FRAMES) + 0.5
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, :3, :3] = Slerp(np.arange(FRAMES + 1), Rotation.from_matrix(base[:, :3, :3]))(when).as_matrix()
+    poses[:, :3, 3] = (base[:-1, :3, 3] + base[1:, :3, 3]) / 2
+    return poses @ BASE_FROM_CAM
+
+
+def base_poses() -> np.ndarray:
+    return embedded_walk(FRAMES + 1, 3, 0.0, 360 / FRAMES) @ np.linalg.inv(BASE_FROM_CAM)
+
+
+@pytest.fixture(scope="module")
+def drive(made_once):
+    """A folder with the bag ``drive``, the scene ``den`` made of it, a tiny run on that, and its bundle with a map."""
+
+    def make(folder: Path) -> None:
+        room = embedded_room()
+        with recorder(folder / "drive", "mcap") as bag:
+            bag.camera("/eye/camera_info", FIRST_NS, CAM, SIZE, K)
+            bag.transform(0, "base_link", CAM, BASE_FROM_CAM, "/tf_static")
+            for row, pose in enumerate(base_poses()):
+                bag.odometry("/odom", FIRST_NS + STEP_NS * row, "odom", "base_link", pose)
+            for row, pose in enumerate(true_poses()):
+                ns = FIRST_NS + STEP_NS * row + STEP_NS // 2
+                bag.image("/eye/image_raw", ns, CAM, render(room, K, pose, SIZE)[0])
+        tool("import_scene", folder / "drive", "--out", folder / "den")
+        model = {"class_path": "LitMambaLoc", "init_args": TINY_MAMBALOC}
+        data = {"scene": str(folder / "den"), "validation": "auto"}
+        recipe = write_recipe(folder / "recipe.yaml", folder, model, data, max_epochs=1)
+        options = ["--map.enabled", "true", "--map.width", "160", "--map.key_frames", "30"]
+        tool("train", recipe, *options, "--trainer.default_root_dir", folder / "run")
+        checkpoint = folder / "run/checkpoints/last.ckpt"
+        tool("evaluate", checkpoint, "--out", folder / "evaluated", "--accelerator", "cpu")
+        tool("export", checkpoint, "--to", "onnx", "--out", folder / "bundle")
+
+    return made_once("drive", make)
+
+
+def evaluated(path: Path) -> dict[int, tuple[float, float]]:
+    """Errors in metres and degrees, by the number of the picture in its topic."""
+    with path.open() as file:
+        return {
+            int(Path(row["image"]).stem): (float(row["position_error_m"]), float(row["rotation_error_deg"]))
+            for row in csv.DictReader(file)
+        }
+
+
+def localised(path: Path) -> dict[int, tuple[float, float]]:
+    """The same of a bag's poses, against where the camera was."""
+    truth, errors = true_poses(), {}
+    for message in messages(path, TOPIC):
+        ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        row, rest = divmod(ns - FIRST_NS - STEP_NS // 2, STEP_NS)
+        assert rest == 0
+        at, turn = message.pose.pose.position, message.pose.pose.orientation
+        off = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).inv() * Rotation.from_matrix(truth[row, :3, :3])
+        errors[row] = (np.linalg.norm(np.array([at.x, at.y, at.z]) - truth[row, :3, 3]), np.degrees(off.magnitude()))
+    return errors
+
+
+@pytest.mark.parametrize(("option", "predictions"), [("--no-map", "predictions"), (None, "predictions_both")])
+@pytest.mark.parametrize("name", ["found", "found.bag"])
+def test_errors_in_the_optical_frame_are_those_of_evaluate(drive, tmp_path, option, predictions, name):
+    words = [drive / "bundle", drive / "drive", "--out", tmp_path / name, *([option] if option else [])]
+    tool("localize", *words)
+    assert is_bag(tmp_path / name)
+    expected, found = evaluated(drive / f"evaluated/{predictions}.csv"), localised(tmp_path / name)
+    common = sorted(expected.keys() & found.keys())
+    print(predictions, len(expected), len(found), len(common), np.abs([np.subtract(expected[k], found[k]) for k in common]).max(axis=0))
+    np.testing.assert_allclose([found[row] for row in common], [expected[row] for row in common], atol=1e-6)
