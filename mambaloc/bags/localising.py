@@ -64,7 +64,9 @@ def localise_bag(
         pictures = _straight(bag, topic, straightener, intrinsics, left_out)
         console = Console(stderr=True)
         try:
-            for picture, image, matrix in track(pictures, "Localising", bag.counts[topic], console=console, transient=True):
+            for picture, image, matrix in track(
+                pictures, "Localising", bag.counts[topic], console=console, transient=True
+            ):
                 found.append(localiser.localise(image, matrix))
                 stated = _stated(found[-1], body_of(picture))
                 if isinstance(stated, str):

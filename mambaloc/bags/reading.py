@@ -88,8 +88,14 @@ class Bag:
             yield connection.topic, self._read(self._reader.deserialize, data, connection.msgtype)
 
     def first(self, topic: str) -> Any:
-        """A topic's first message."""
-        return next(self.messages([topic]))[1]
+        """A topic's first message.
+
+        Raises:
+            InputError: where the bag is damaged.
+        """
+        for _, message in self.messages([topic]):
+            return message
+        raise InputError(f"{self.path}: cannot be read ({topic} lacks its {self.counts[topic]} messages). {_FORGOTTEN}")
 
     def _read(self, read: Callable[..., T], *arguments: Any) -> T:
         return _read(self.path, read, *arguments)

@@ -62,7 +62,7 @@ def drive(made_once):
                 bag.image("/eye/image_raw", ns, CAM, render(room, K, pose, SIZE)[0])
         tool("import_scene", folder / "drive", "--out", folder / "den")
         model = {"class_path": "LitMambaLoc", "init_args": TINY_MAMBALOC}
-        data = {"scene": str(folder / "den"), "validation": "auto"}
+        data = {"scene": str(folder / "den"), "validation": "block", "val_fraction": 0.25}
         recipe = write_recipe(folder / "recipe.yaml", folder, model, data, max_epochs=1)
         options = ["--map.enabled", "true", "--map.width", "160", "--map.key_frames", "30"]
         tool("train", recipe, *options, "--trainer.default_root_dir", folder / "run")
@@ -89,19 +89,60 @@ def localised(path: Path) -> dict[int, tuple[float, float]]:
         ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         row, rest = divmod(ns - FIRST_NS - STEP_NS // 2, STEP_NS)
         assert rest == 0
-        at, turn = message.pose.pose.position, message.pose.pose.orientation
-        off = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).inv() * Rotation.from_matrix(truth[row, :3, :3])
-        errors[row] = (np.linalg.norm(np.array([at.x, at.y, at.z]) - truth[row, :3, 3]), np.degrees(off.magnitude()))
+        found = pose_of(message)
+        off = Rotation.from_matrix(found[:3, :3].T @ truth[row, :3, :3])
+        errors[row] = (np.linalg.norm(found[:3, 3] - truth[row, :3, 3]), np.degrees(off.magnitude()))
     return errors
 
 
-@pytest.mark.parametrize(("option", "predictions"), [("--no-map", "predictions"), (None, "predictions_both")])
-@pytest.mark.parametrize("name", ["found", "found.bag"])
+def pose_of(message) -> np.ndarray:
+    """A message's pose as a matrix."""
+    at, turn = message.pose.pose.position, message.pose.pose.orientation
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    matrix[:3, 3] = at.x, at.y, at.z
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("option", "predictions", "name"), [("--no-map", "predictions", "found"), (None, "predictions_both", "found.bag")]
+)
 def test_errors_in_the_optical_frame_are_those_of_evaluate(drive, tmp_path, option, predictions, name):
+    """Guess: equal to 1e-6 by the map alone, as a network is exported in float32. The network's are, too."""
     words = [drive / "bundle", drive / "drive", "--out", tmp_path / name, *([option] if option else [])]
     tool("localize", *words)
     assert is_bag(tmp_path / name)
     expected, found = evaluated(drive / f"evaluated/{predictions}.csv"), localised(tmp_path / name)
     common = sorted(expected.keys() & found.keys())
-    print(predictions, len(expected), len(found), len(common), np.abs([np.subtract(expected[k], found[k]) for k in common]).max(axis=0))
+    assert len(common) > len(expected) / 2  # poses without radii are left out
     np.testing.assert_allclose([found[row] for row in common], [expected[row] for row in common], atol=1e-6)
+
+
+def test_poses_of_the_robot_are_written_by_its_transforms(drive, tmp_path):
+    """The camera's pose times its place on the robot, with a covariance that the arm between them makes larger."""
+    for name, options in (("camera", []), ("base", ["--pose-frame", "base_link", "--world-frame", "odom"])):
+        tool("localize", drive / "run/map/map.safetensors", drive / "drive", "--out", tmp_path / name, *options)
+    for of_camera, of_base in zip(*(messages(tmp_path / name, TOPIC) for name in ("camera", "base")), strict=True):
+        np.testing.assert_allclose(pose_of(of_camera) @ np.linalg.inv(BASE_FROM_CAM), pose_of(of_base), atol=1e-9)
+        spreads = [np.diag(each.pose.covariance.reshape(6, 6)) for each in (of_camera, of_base)]
+        assert spreads[1][:3].sum() > spreads[0][:3].sum() > 0
+        assert (of_camera.header.frame_id, of_base.header.frame_id) == ("map", "odom")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--out", "poses.tum"], "--out poses.tum: a bag's poses go into a bag"),
+        (["--out", "found", "--filter", "causal"], "--filter causal: a bag's poses are for a robot's own filter"),
+        (["--out", "found", "--topic", "/up"], "--topic /up"),
+        (["--out", "found", "--pose-frame", "arm"], "no transform links the frames 'camera_optical' and 'arm'"),
+        (["--out", "."], "is there already"),
+    ],
+)
+def test_wrong_uses_are_refused_in_a_line(drive, tmp_path, monkeypatch, capsys, options, says):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        tool("localize", drive / "run/map/map.safetensors", drive / "drive", *options)
+    assert ended.value.code == 2
+    assert says in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())

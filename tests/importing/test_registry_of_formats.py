@@ -32,6 +32,7 @@ FILES = {
     "structure_from_motion": ["a.jpg", "b.jpg", "notes.txt"],
 }
 WRITTEN = {
+    "ros_bag": {"metadata.yaml": "rosbag2_bagfile_information:\n  version: 5\n", "drive_0.db3": "", "a.jpg": ""},
     "pose_lines": {"images/1.jpg": "", "images/2.jpg": "", "any.log": f"{MATRIX}\n{MATRIX}\n"},
     "pose_files": {"1.color.png": "", "1.pose.txt": MATRIX, "seq-02/1.color.png": "", "seq-02/1.pose.txt": MATRIX},
     "tum": {"images/1.2.jpg": "", "path.txt": "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1 0\n"},
@@ -86,6 +87,8 @@ def test_formats_are_told_by_their_lines(tmp_path, kind, files):
         ("tum", "a.tum"),
         ("kitti_poses", "a.kitti"),
         ("record3d", "a.r3d"),
+        ("ros_bag", "a.bag"),
+        ("ros_bag", "a.mcap"),
         ("structure_from_motion", "a.MP4"),
     ],
 )

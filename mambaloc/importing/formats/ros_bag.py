@@ -189,8 +189,9 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
     for frame in choose_frames(with_pose()):
         assert isinstance(frame, _PosedFrame)
         data, suffix = _file_of(frame.picture)
-        frames.append({"name": f"{frame.picture.number:06d}{suffix}", "ns": frame.picture.ns})
-        (folder / frames[-1]["name"]).write_bytes(data)
+        name = f"{frame.picture.number:06d}{suffix}"
+        (folder / name).write_bytes(data)
+        frames.append({"name": name, "ns": frame.picture.ns})
         poses.append(frame.pose)
     if not frames:
         raise InputError(

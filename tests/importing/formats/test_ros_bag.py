@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import sys
+import warnings
 import weakref
 
 import cv2
@@ -13,7 +14,7 @@ from bag_writing import FIRST_NS, KINDS, png, recorder
 from captures import tool
 from scipy.spatial.transform import Rotation, Slerp
 
-from mambaloc.errors import InputWarning
+from mambaloc.errors import InputError, InputWarning
 from mambaloc.importing.formats import ros_bag
 from mambaloc.importing.formats.ros_bag import BagTopics, read_ros_bag
 from mambaloc.importing.registry import FORMATS, read_capture
@@ -228,6 +229,25 @@ def test_a_damaged_bag_is_refused_in_a_line(record, drive, refused, kind):
     for data in (b"", whole[:50], whole[: len(whole) // 2], whole[: -len(whole) // 4]):
         file.write_bytes(data)
         refused(read_ros_bag, path, "drive", "cannot be read")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_random_damage_is_read_or_refused_in_a_line(record, drive, kind):
+    small = [np.ascontiguousarray(rgb[::20, ::20]) for rgb in drive[4]]
+    path = record(lambda bag: (write_pictures(bag, (*drive[:4], small)), write_poses(bag, drive, "tf")), kind)
+    file = path if path.is_file() else next(each for each in path.iterdir() if each.suffix != ".yaml")
+    rng, whole = np.random.default_rng(0), file.read_bytes()
+    for _ in range(10):
+        data = bytearray(whole)
+        for start in rng.integers(0, len(whole), 3).tolist():
+            data[start : start + 8] = rng.choice([0, 127, 255], 8).astype(np.uint8).tobytes()
+        file.write_bytes(data)
+        with warnings.catch_warnings(action="ignore"):
+            try:
+                read = [image.is_file() for image in read_ros_bag(path).images]
+            except InputError as error:
+                read = ["\n" not in str(error)]
+        assert all(read)
 
 
 def test_without_rosbags_the_extra_is_named(record, drive, refused, monkeypatch):
