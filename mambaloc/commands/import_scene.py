@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mambaloc.console import OptionParser, exits_cleanly
 from mambaloc.errors import InputError
+from mambaloc.importing.formats.ros_bag import BagTopics
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import FORMATS
 from mambaloc.importing.report import print_summary
@@ -24,15 +25,27 @@ def main() -> None:
     parser.add_argument(
         "--images", type=Path, metavar="FOLDER", help="the capture's pictures, where they lie elsewhere"
     )
+    parser.add_argument("--topic", metavar="NAME", help="of a ROS bag's pictures, where it has several")
+    parser.add_argument("--pose-topic", metavar="NAME", help="of a ROS bag's poses, or /tf, where it has several")
+    parser.add_argument("--pose-frame", metavar="FRAME", help="that a ROS bag's poses are of, where they do not say it")
     parser.add_argument("--metres-per-unit", type=float, metavar="X", help="the capture's unit, where it is known")
     parser.add_argument(
         "--split", default="auto", choices=ASKED, help="what to test on; the measured best unless given"
     )
     parser.add_argument("--adjust-poses", action="store_true", help="also write poses that fit the pictures better")
     args = parser.parse_args()
+    topics = BagTopics(args.topic, args.pose_topic, args.pose_frame)
     command = shlex.join(["python", *sys.argv])
     imported = import_scene(
-        args.source, args.out, args.format, args.metres_per_unit, args.split, command, args.adjust_poses, args.images
+        args.source,
+        args.out,
+        args.format,
+        args.metres_per_unit,
+        args.split,
+        command,
+        args.adjust_poses,
+        args.images,
+        None if topics == BagTopics() else topics,
     )
     print_summary(imported, args.out)
     if not imported.verdict.is_usable:

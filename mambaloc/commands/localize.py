@@ -1,8 +1,12 @@
-"""Localise pictures: mambaloc localize [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA [--filter causal|smooth]."""
+"""Localise pictures: mambaloc localize [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA_OR_BAG [--filter causal|smooth]."""
 
+from argparse import Namespace
 from pathlib import Path
 
+from mambaloc.bags.reading import is_bag
+from mambaloc.bags.writing import TOPIC
 from mambaloc.console import OptionParser, black_and_white, exits_cleanly, pinhole_matrix, thread_count
+from mambaloc.errors import InputError
 from mambaloc.runtime import Localiser
 from mambaloc.runtime.video import FILTERS, follow
 
@@ -17,8 +21,15 @@ def main() -> None:
         metavar="MODEL|MAP",
         help="bundle, exported model, map.safetensors or ARCH.TAG; unless given, the embedded room's",
     )
-    parser.add_argument("source", help="a video, a picture, a folder of pictures (30 a second), or a camera's number")
-    parser.add_argument("--out", type=Path, default=Path("poses.tum"), help="trajectory to write, TUM format")
+    parser.add_argument(
+        "source", help="a video, a picture, a folder of pictures (30 a second), a camera's number, or a ROS bag"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("poses.tum"),
+        help="trajectory to write, TUM format; of a ROS bag, another bag: FILE.bag of ROS 1, or a folder of ROS 2",
+    )
     parser.add_argument("--filter", choices=FILTERS, help="steady a video's poses: from those before, or from all")
     parser.add_argument(
         "--intrinsics",
@@ -37,10 +48,39 @@ def main() -> None:
         "--map", dest="sparse_map", default=True, metavar="FILE", help="beside the model; a bundle's own unless given"
     )
     maps.add_argument("--no-map", dest="sparse_map", action="store_false", help="let the network answer alone")
+    parser.add_argument("--topic", metavar="NAME", help="of a bag's pictures, where it has several")
+    parser.add_argument("--world-frame", metavar="FRAME", help="that a bag's poses are in; map unless given")
+    parser.add_argument("--pose-frame", metavar="FRAME", help="that a bag's poses are of; the camera's unless given")
     parser.add_argument("--threads", type=thread_count, help="that the network may use for one image")
     args = parser.parse_args()
     localiser = Localiser(_model(args.model), args.threads, args.sparse_map)
+    if is_bag(Path(args.source)):
+        _localise_bag(localiser, args)
+        return
+    if args.topic or args.world_frame or args.pose_frame:
+        raise InputError(f"{args.source}: is no ROS bag. Leave --topic, --world-frame and --pose-frame out.")
     print(f"{args.out}: {follow(localiser, args.source, args.out, args.filter, args.intrinsics, args.counts)}")
+
+
+def _localise_bag(localiser: Localiser, args: Namespace) -> None:
+    from mambaloc.bags.localising import localise_bag  # only here: an extra
+    from mambaloc.importing.formats.ros_bag import straightener
+
+    if args.filter is not None:
+        raise InputError(f"--filter {args.filter}: a bag's poses are for a robot's own filter, as found. Leave it out.")
+    if args.out.suffix == ".tum":
+        raise InputError(f"--out {args.out}: a bag's poses go into a bag. Give --out FILE.bag, or a folder for ROS 2.")
+    said = localise_bag(
+        localiser,
+        Path(args.source),
+        args.out,
+        straightener,
+        args.topic,
+        args.intrinsics,
+        args.world_frame or "map",
+        args.pose_frame,
+    )
+    print(f"{args.out}: {TOPIC}, {said}")
 
 
 def _model(name: str | None) -> Path:

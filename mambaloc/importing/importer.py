@@ -15,6 +15,7 @@ from mambaloc.importing.checks import sanity
 from mambaloc.importing.checks.agreement import Agreement, agreement, check_agreement
 from mambaloc.importing.checks.conventions import check_axes, check_up, up_of
 from mambaloc.importing.checks.findings import Finding, verdict_of
+from mambaloc.importing.formats.ros_bag import BagTopics
 from mambaloc.importing.motion import Motion, motion_of
 from mambaloc.importing.registry import read_capture
 from mambaloc.importing.report import write_report
@@ -35,6 +36,7 @@ def import_scene(
     command: str = "",
     with_adjusted: bool = False,
     images: Path | None = None,
+    topics: BagTopics | None = None,
 ) -> Imported:
     """Read a capture, check it, split it, and write it as a scene's folder, which appears once it is whole.
 
@@ -47,6 +49,7 @@ def import_scene(
         command: that this was asked for with.
         with_adjusted: also write poses that are adjusted to the pictures, in a file of their own.
         images: the folder of the capture's images, where its format names them by paths; found unless given.
+        topics: what to read of a ROS bag.
 
     Raises:
         InputError: for a source that is none, a folder that is there or cannot be written, or a split that cannot be
@@ -60,7 +63,7 @@ def import_scene(
         raise InputError(
             f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
         )
-    capture = read_capture(source, kind, images)
+    capture = read_capture(source, kind, images, topics)
     named = capture.left_out
     capture, lost = in_its_world(capture, metres_per_unit)
     with whole_folder(out, "choose another folder with --out") as partial:

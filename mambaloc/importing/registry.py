@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from mambaloc.bags.reading import is_bag
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats import (
@@ -23,10 +24,12 @@ from mambaloc.importing.formats import (
     pose_folders,
     pose_lines,
     realityscan,
+    ros_bag,
     seven_scenes,
     stray_scanner,
     tum,
 )
+from mambaloc.importing.formats.ros_bag import BagTopics
 from mambaloc.importing.sfm import structure
 
 
@@ -53,6 +56,7 @@ def _by_name_alone(source: Path) -> bool:
 
 
 FORMATS: dict[str, Format] = {
+    "ros_bag": Format("a .bag of ROS 1; the folder, .mcap or .db3 of a ROS 2 bag", is_bag, ros_bag.read_ros_bag),
     "nerfstudio": Format("transforms.json of nerfstudio or instant-ngp", nerfstudio.matches, nerfstudio.read, True),
     "record3d": Format("metadata and rgbd/ of Record3D", arkit.is_record3d, arkit.read_record3d),
     "polycam": Format("keyframes/cameras/ and images/ of Polycam", arkit.is_polycam, arkit.read_polycam),
@@ -127,13 +131,16 @@ FORMATS: dict[str, Format] = {
 """By name, the most telling first: the first that matches a source is taken."""
 
 
-def read_capture(source: Path, kind: str | None = None, images: Path | None = None) -> Capture:
+def read_capture(
+    source: Path, kind: str | None = None, images: Path | None = None, topics: BagTopics | None = None
+) -> Capture:
     """Read a capture, in the format that its files look like unless one is named.
 
     Args:
         source: the capture.
         kind: of :data:`FORMATS`.
         images: the folder of its images; found unless given.
+        topics: what to read of a ROS bag.
 
     Raises:
         InputError: where there is no such source or format, or it cannot be read.
@@ -146,6 +153,10 @@ def read_capture(source: Path, kind: str | None = None, images: Path | None = No
     if kind is None:
         known = "; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
         raise InputError(f"{source}: looks like no format that is known ({known}); name it with --format")
+    if topics is not None:
+        if kind != "ros_bag":
+            raise InputError(f"{source}: is no ROS bag but {kind}, without topics. Leave --topic and --pose-* out.")
+        return ros_bag.read_ros_bag(source, topics)
     if images is None:
         return FORMATS[kind].read(source)
     if not FORMATS[kind].names_images:

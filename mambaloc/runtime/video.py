@@ -112,6 +112,18 @@ def follow(
         raise InputError(f"{source}: holds no frame; give another video")
     if not kept:
         raise InputError(f"{source}: none of its {len(found)} frames was localised. Give frames of the map's place.")
+    return summarise(localiser, [pose for _, pose in found], outliers)
+
+
+def summarise(localiser: Localiser, found: Sequence[Localisation], outliers: int | None = None) -> Followed:
+    """Say what became of frames.
+
+    Args:
+        localiser: that found their poses.
+        found: a frame's each, at least one with a pose.
+        outliers: as of :class:`Followed`.
+    """
+    poses = [pose for pose in found if pose.source is not None]
     has_both = localiser.contract is not None and localiser.sparse_map is not None
     return Followed(
         localiser.scene,
@@ -119,7 +131,7 @@ def follow(
         len(found) - len(poses),
         sum(pose.source == "map" for pose in poses) if has_both else None,
         outliers,
-        1000 * float(np.median([pose.latency_s for _, pose in found])),
+        1000 * float(np.median([pose.latency_s for pose in found])),
         sum(pose.is_unfamiliar for pose in poses),
         _median_radii(poses),
     )

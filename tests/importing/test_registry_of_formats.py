@@ -56,6 +56,7 @@ WRITTEN = {
         "any.csv": "#cameras 1\n#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm\n1.jpg,0,0,0,0,0,0,30,0\n",
     },
     "metashape": {"photos/1.jpg": "", "export.xml": '<?xml version="1.0"?>\n<document version="2">\n<chunk></chunk>'},
+    "ros_bag": {"metadata.yaml": "rosbag2_bagfile_information:\n  version: 5\n", "drive_0.db3": "", "a.jpg": ""},
     "pose_lines": {"images/1.jpg": "", "images/2.jpg": "", "any.log": f"{MATRIX}\n{MATRIX}\n"},
     "pose_files": {"1.color.png": "", "1.pose.txt": MATRIX, "seq-02/1.color.png": "", "seq-02/1.pose.txt": MATRIX},
     "tum": {"images/1.2.jpg": "", "path.txt": "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1 0\n"},
@@ -112,6 +113,8 @@ def test_formats_are_told_by_their_lines(tmp_path, kind, files):
         ("tum", "a.tum"),
         ("kitti_poses", "a.kitti"),
         ("record3d", "a.r3d"),
+        ("ros_bag", "a.bag"),
+        ("ros_bag", "a.mcap"),
         ("structure_from_motion", "a.MP4"),
     ],
 )

@@ -1,0 +1,132 @@
+"""Localise a bag's pictures, and write their poses into another bag."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.console import Console
+from rich.progress import track
+
+from mambaloc.bags.pictures import BagCamera, Picture, camera_of, picture_topic, pictures_of
+from mambaloc.bags.reading import Bag, open_bag
+from mambaloc.bags.transforms import Chain, Gap, Matrix, Transforms, along
+from mambaloc.bags.writing import covariance_of, moved, pose_bag
+from mambaloc.errors import InputError, InputWarning
+from mambaloc.images import Image
+from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.localiser import Localiser
+from mambaloc.runtime.video import Followed, summarise
+
+Straightener = Callable[[BagCamera, tuple[int, int]], tuple[Matrix, Callable[[Image], Image]]]
+"""Of a camera and a picture's size: intrinsics of pictures as the scene has them, and what makes a picture so."""
+
+_REMEDY = "Give pictures of the place, and a model that states radii or has a map of it."
+
+
+def localise_bag(
+    localiser: Localiser,
+    source: Path,
+    out: Path,
+    straightener: Straightener,
+    topic: str | None = None,
+    intrinsics: ArrayLike | None = None,
+    world: str = "map",
+    frame: str | None = None,
+) -> Followed:
+    """Localise every picture of a bag, and write what a robot's filter takes: poses with covariances, at its times.
+
+    A pose without radii says nothing to a filter, nor does that of a picture that does not look like the place: these
+    are left out with a warning, as are pictures that are damaged. Ctrl-C ends it; what was found is written then.
+
+    Args:
+        localiser: of the model.
+        source: the bag.
+        out: the bag to write, as :func:`~mambaloc.bags.writing.pose_bag` takes it.
+        straightener: removes the distortion that the bag's ``CameraInfo`` has.
+        topic: of the pictures; the only one unless given.
+        intrinsics: of every picture, (3, 3) in pixels; those of ``CameraInfo`` unless given.
+        world: the name of the scene's frame in messages.
+        frame: whose poses to write, through the bag's transforms; the camera's optical frame unless given.
+
+    Raises:
+        InputError: where a bag cannot be read or written, a picture cannot be localised, or none has a pose to write.
+    """
+    found: list[Localisation] = []
+    left_out, written = Counter[str](), 0
+    with open_bag(source) as bag, pose_bag(out, world) as write:
+        topic = picture_topic(bag, topic)
+        body_of = _body_of(bag, frame)
+        pictures = _straight(bag, topic, straightener, intrinsics, left_out)
+        console = Console(stderr=True)
+        try:
+            for picture, image, matrix in track(
+                pictures, "Localising", bag.counts[topic], console=console, transient=True
+            ):
+                found.append(localiser.localise(image, matrix))
+                stated = _stated(found[-1], body_of(picture))
+                if isinstance(stated, str):
+                    left_out[stated] += 1
+                else:
+                    write(picture.ns, *stated)
+                    written += 1
+        except KeyboardInterrupt:
+            pass
+        said = "; ".join(f"{count} {why}" for why, count in left_out.items())
+        if not written:
+            raise InputError(f"{source}: no picture of {topic} has a pose to write ({said}). {_REMEDY}")
+    if said:
+        warnings.warn(f"{out}: leaves out {said}.", InputWarning, stacklevel=2)
+    return summarise(localiser, found)
+
+
+def _stated(pose: Localisation, cam_from_body: Matrix | Gap) -> tuple[Matrix, Matrix, Matrix] | str:
+    """Position, quaternion and covariance of a body, or why a filter should not have them."""
+    covariance = covariance_of(pose)
+    if pose.source is None:
+        return "without a pose"
+    if pose.is_unfamiliar:
+        return "that do not look like the place"
+    if covariance is None:
+        return "without radii"
+    if isinstance(cam_from_body, Gap):
+        return f"without a transform to {cam_from_body.link.child}"
+    return moved(np.asarray(pose.position_m), np.asarray(pose.quaternion), covariance, cam_from_body)
+
+
+def _body_of(bag: Bag, frame: str | None) -> Callable[[Picture], Matrix | Gap]:
+    """What gives ``cam_from_body`` (4, 4) at a picture's time."""
+    if frame is None:
+        return lambda picture: np.eye(4)
+    transforms, paths = Transforms(bag), dict[str, Chain]()
+
+    def at(picture: Picture) -> Matrix | Gap:
+        if picture.frame not in paths:
+            paths[picture.frame] = transforms.path(picture.frame, frame)
+        return along(paths[picture.frame], picture.ns)
+
+    return at
+
+
+def _straight(
+    bag: Bag, topic: str, straightener: Straightener, intrinsics: ArrayLike | None, left_out: Counter[str]
+) -> Iterator[tuple[Picture, Image, ArrayLike | None]]:
+    """A topic's whole pictures as the scene has them, with their intrinsics; None where nothing says them."""
+    told = None if intrinsics is not None else camera_of(bag, topic)
+    made: dict[tuple[int, int], tuple[Matrix, Callable[[Image], Image]]] = {}
+    for picture in pictures_of(bag, topic):
+        if isinstance(picture.image, str):
+            left_out["that are damaged"] += 1
+            continue
+        if told is None:
+            yield picture, picture.image, intrinsics
+            continue
+        size = picture.image.shape[1], picture.image.shape[0]
+        if size not in made:
+            made[size] = straightener(told, size)
+        matrix, straighten = made[size]
+        yield picture, straighten(picture.image), matrix

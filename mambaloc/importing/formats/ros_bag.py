@@ -1,0 +1,220 @@
+"""Robots' recordings: ROS 1 bags (``.bag``) and ROS 2 bags (a folder, ``.mcap`` or ``.db3``), read by rosbags.
+
+A picture's time and its camera's optical frame are those of its message's header. That frame has OpenCV's axes, z
+forward, x right and y down (REP 103). It is placed by a topic of poses or by ``/tf``, whose transforms are
+interpolated at the picture's time; ``/tf_static`` links the robot to the camera.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from mambaloc.bags.pictures import BagCamera, Picture, camera_of, picture_topic, pictures_of
+from mambaloc.bags.poses import Gaps, pose_source
+from mambaloc.bags.reading import Bag, frame_name, open_bag
+from mambaloc.bags.transforms import Gap, along
+from mambaloc.errors import InputError, InputWarning
+from mambaloc.images import Image
+from mambaloc.importing.capture import Camera, Capture
+from mambaloc.importing.film import digest_of
+from mambaloc.importing.formats.builder import Posed, build_capture, pinhole
+from mambaloc.importing.formats.parsing import folder_name
+from mambaloc.importing.frame_choice import choose_frames
+from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
+from mambaloc.importing.undistort.fitting import FittedCameras
+from mambaloc.runtime.sources import SourceFrame
+from mambaloc.user_cache import made_once
+
+_VERSION = 1  # of what is kept; another one is made again
+_NOTE, _POSES = "note.json", "poses.npy"
+_LENSES = {
+    "plumb_bob": (opencv_lens, (4, 5)),
+    "rational_polynomial": (opencv_lens, (8, 12, 14)),
+    "equidistant": (opencv_fisheye, (4,)),
+    "fisheye": (opencv_fisheye, (4,)),
+}
+"""Models of distortion, and how many coefficients each may have."""
+
+
+@dataclass(frozen=True)
+class BagTopics:
+    """What to read of a bag that has several.
+
+    Args:
+        pictures: the topic of pictures.
+        poses: the topic of poses, or ``/tf``.
+        pose_frame: the frame that the poses are of, where their messages do not say it.
+    """
+
+    pictures: str | None = None
+    poses: str | None = None
+    pose_frame: str | None = None
+
+
+def read_ros_bag(source: Path, topics: BagTopics | None = None) -> Capture:
+    """Choose pictures that have a pose for sharpness and movement; they are kept in the user's cache.
+
+    Args:
+        source: as :func:`~mambaloc.bags.reading.is_bag` takes it.
+        topics: what to read; the only ones there are unless given.
+
+    Raises:
+        InputError: for a bag that cannot be read, that does not say where its camera was, or that has several topics of
+            which none is named.
+    """
+    asked = topics or BagTopics()
+    with open_bag(source) as bag:
+        topic = picture_topic(bag, asked.pictures)
+        told = camera_of(bag, topic)
+        digest = digest_of(_files(source), _VERSION, topic, asked.poses, asked.pose_frame)
+        folder = made_once(f"bags/{digest}", lambda partial: _write_chosen(bag, topic, asked, partial))
+    note, poses = json.loads((folder / _NOTE).read_text(encoding="utf-8")), np.load(folder / _POSES)
+    if note["gaps"]:
+        warnings.warn(f"{source}: {note['gaps']}.", InputWarning, stacklevel=2)
+    cameras = {} if told is None else {"camera": camera_from(told, f"{source}: CameraInfo of {topic}")}
+    sequence = folder_name(source) if source.is_dir() else source.stem
+    frames = sorted(zip(note["frames"], poses, strict=True), key=lambda frame: frame[0]["ns"])
+    posed = [
+        Posed(folder / each["name"], sequence, pose, next(iter(cameras), None), each["ns"] / 1e9)
+        for each, pose in frames
+    ]
+    return build_capture(
+        "ros_bag",
+        source,
+        posed,
+        unit="metre",
+        choices={
+            "axes": f"OpenCV camera axes, which the optical frame {note['camera']} has (REP 103)",
+            "direction": f"camera-to-world: {note['chain']}, by {note['poses']}",
+            "scale": "metres (REP 103)",
+            "origin": f"kept: that of {note['world']}",
+            "times": "of the messages' headers; transforms interpolated there",
+            "frames": f"{len(posed)} of {note['count']} in {topic}, by sharpness and movement",
+            **({"gaps": note["gaps"]} if note["gaps"] else {}),
+        },
+        cameras=cameras,
+        left_out={Path(name): rule for name, rule in note["damaged"].items()},
+    )
+
+
+def camera_from(told: BagCamera, where: str) -> Camera:
+    """A bag's camera with its lens.
+
+    Args:
+        told: by ``CameraInfo``.
+        where: it is, for messages.
+
+    Raises:
+        InputError: for a distortion of no known model, or numbers that no lens has.
+    """
+    (fx, fy), (cx, cy) = told.matrix[(0, 1), (0, 1)].tolist(), told.matrix[:2, 2].tolist()
+    camera = pinhole(told.size, (fx, fy), (cx, cy), where)
+    if not told.coefficients:
+        return camera
+    lens, counts = _LENSES.get(told.model, (opencv_lens, ()))
+    if len(told.coefficients) not in counts:
+        raise InputError(
+            f"{where}: has the distortion model {told.model!r} with {len(told.coefficients)} coefficients, which is "
+            f"not read ({', '.join(_LENSES)}). Record a rectified topic."
+        )
+    distorted = lens(camera.focal_px, camera.centre_px, told.coefficients)
+    return Camera(camera.width, camera.height, camera.focal_px, camera.centre_px, distorted, told.model)
+
+
+def straightener(told: BagCamera, size: tuple[int, int]) -> tuple[NDArray[np.float64], Callable[[Image], Image]]:
+    """Intrinsics (3, 3) of a bag's pictures of a size as an import writes them, and what makes a picture so.
+
+    Raises:
+        InputError: for pictures of another shape than the camera's, or as :func:`camera_from`.
+    """
+    name = "CameraInfo"
+    cameras = FittedCameras({name: camera_from(told, name)})
+    fit = cameras.fitted(name, size)
+    if fit is None:
+        shapes = " and ".join("{}x{}".format(*each) for each in (size, told.size))
+        raise InputError(f"{name}: pictures and camera have other shapes ({shapes}). Give these with --intrinsics.")
+    used, maps = cameras.as_used([name], [size], {size: size})[1][name], fit[1]
+    matrix = np.array([[used.focal_px[0], 0, used.centre_px[0]], [0, used.focal_px[1], used.centre_px[1]], [0, 0, 1]])
+
+    def straighten(image: Image) -> Image:
+        if maps is None:
+            return image
+        straight: Any = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return straight
+
+    return matrix, straighten
+
+
+def _files(source: Path) -> list[Path]:
+    return sorted(path for path in source.iterdir() if path.is_file()) if source.is_dir() else [source]
+
+
+@dataclass(frozen=True)
+class _PosedFrame(SourceFrame):
+    picture: Picture
+    pose: NDArray[np.float64]
+
+
+def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
+    """Write chosen pictures as they were recorded, raw ones as PNG, beside their poses and a note."""
+    camera = frame_name(bag.first(topic).header.frame_id)
+    source = pose_source(bag, camera, asked.poses, asked.pose_frame)
+    gaps, damaged = Gaps(), dict[str, str]()
+
+    def with_pose() -> Iterator[_PosedFrame]:
+        seen = set()
+        count, console = bag.counts[topic], Console(stderr=True)
+        for picture in track(pictures_of(bag, topic), "Choosing frames", count, console=console, transient=True):
+            pose = along(source.path, picture.ns)
+            if isinstance(pose, Gap):
+                gaps.add(pose)
+            elif isinstance(picture.image, str):
+                damaged[f"{topic}, message {picture.number}"] = picture.image
+            elif picture.ns not in seen:  # else it was recorded twice
+                seen.add(picture.ns)
+                yield _PosedFrame(str(picture.number), picture.ns / 1e9, picture.image, picture, pose)
+
+    frames, poses = [], []
+    for frame in choose_frames(with_pose()):
+        assert isinstance(frame, _PosedFrame)
+        data, suffix = _file_of(frame.picture)
+        name = f"{frame.picture.number:06d}{suffix}"
+        (folder / name).write_bytes(data)
+        frames.append({"name": name, "ns": frame.picture.ns})
+        poses.append(frame.pose)
+    if not frames:
+        raise InputError(
+            f"{bag.path}: no picture of {topic} has a pose; {gaps or 'none is whole'}. Record both at once."
+        )
+    np.save(folder / _POSES, np.array(poses))
+    note = {
+        "frames": frames,
+        "count": bag.counts[topic],
+        "camera": camera,
+        "world": source.world,
+        "chain": source.said,
+        "poses": source.name,
+        "gaps": str(gaps),
+        "damaged": damaged,
+    }
+    (folder / _NOTE).write_text(json.dumps(note), encoding="utf-8")
+
+
+def _file_of(picture: Picture) -> tuple[bytes, str]:
+    """The picture's file as it was recorded, or a PNG, and its suffix."""
+    for start, suffix in ((b"\xff\xd8", ".jpg"), (b"\x89PNG", ".png")):
+        if picture.file is not None and picture.file.startswith(start):
+            return picture.file, suffix
+    image: Any = picture.image
+    return cv2.imencode(".png", image[..., ::-1])[1].tobytes(), ".png"
