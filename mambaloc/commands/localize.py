@@ -20,11 +20,17 @@ def main() -> None:
     parser.add_argument("source", help="a video, a picture, a folder of pictures (30 a second), or a camera's number")
     parser.add_argument("--out", type=Path, default=Path("poses.tum"), help="trajectory to write, TUM format")
     parser.add_argument("--filter", choices=FILTERS, help="steady a video's poses: from those before, or from all")
-    parser.add_argument(
+    cameras = parser.add_mutually_exclusive_group()
+    cameras.add_argument(
         "--intrinsics",
         type=pinhole_matrix,
         metavar="FX,FY,CX,CY",
         help="of the frames, in pixels; the training camera's unless given",
+    )
+    cameras.add_argument(
+        "--distorted",
+        action="store_true",
+        help="frames are as the training camera stores them, and are undistorted by its lens",
     )
     parser.add_argument(
         "--counts",
@@ -40,7 +46,10 @@ def main() -> None:
     parser.add_argument("--threads", type=thread_count, help="that the network may use for one image")
     args = parser.parse_args()
     localiser = Localiser(_model(args.model), args.threads, args.sparse_map)
-    print(f"{args.out}: {follow(localiser, args.source, args.out, args.filter, args.intrinsics, args.counts)}")
+    followed = follow(
+        localiser, args.source, args.out, args.filter, args.intrinsics, args.counts, is_distorted=args.distorted
+    )
+    print(f"{args.out}: {followed}")
 
 
 def _model(name: str | None) -> Path:

@@ -314,10 +314,10 @@ def test_ctrl_c_writes_what_was_found(filtering, model, pictures, tmp_path, monk
     localiser = Localiser(model)
     localise, left = localiser.localise, iter(range(5))
 
-    def interrupted(image, intrinsics):
+    def interrupted(image, *how):
         if next(left, None) is None:
             raise KeyboardInterrupt
-        return localise(image, intrinsics)
+        return localise(image, *how)
 
     monkeypatch.setattr(localiser, "localise", interrupted)
     assert follow(localiser, str(pictures), tmp_path / "poses.tum", filtering).count == 5
