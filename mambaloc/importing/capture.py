@@ -42,11 +42,14 @@ class Depth:
         files: of each image the 16-bit PNG, or None; 0 and 65535 are pixels without a measurement.
         intrinsics: (3, 3), in pixels of depth frames; another lens than the images' where the sensor has one.
         step: how far one more in a file is, in the capture's unit.
+        confidence: of each depth frame the 8-bit PNG of its size, or None; pixels that are 0 there are left out. Empty
+            where the format has none.
     """
 
     files: tuple[Path | None, ...]
     intrinsics: NDArray[np.float64]
     step: float = 0.001
+    confidence: tuple[Path | None, ...] = ()
 
 
 @dataclass(frozen=True)

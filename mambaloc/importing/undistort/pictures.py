@@ -102,6 +102,9 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
         return None if values is None else tuple(values[row] for row in rows)
 
     depth = capture.depth
+    if depth is not None:
+        confidence = tuple(depth.confidence[row] for row in rows) if depth.confidence else ()
+        depth = replace(depth, files=tuple(depth.files[row] for row in rows), confidence=confidence)
     return replace(
         capture,
         images=tuple(capture.images[row] for row in rows),
@@ -110,7 +113,7 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
         camera_of=of(capture.camera_of),
         time_s=None if capture.time_s is None else capture.time_s[np.array(rows, dtype=np.int64)],
         split=of(capture.split),
-        depth=depth and replace(depth, files=tuple(depth.files[row] for row in rows)),
+        depth=depth,
         tracks=capture.tracks and capture.tracks.of_frames(np.array(rows, dtype=np.int64)),
     )
 
