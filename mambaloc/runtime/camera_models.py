@@ -89,7 +89,8 @@ class OpenCVModel(CameraModel):
     name = "pinhole"
     counts = (4, 5, 8, 12, 14)
 
-    def __call__(self, rays: Floats) -> Floats:  # noqa: D102
+    def __call__(self, rays: Floats) -> Floats:
+        """Pixels of rays, both (N, 2)."""
         points = np.concatenate((rays, np.ones((len(rays), 1))), axis=1)[:, None]
         matrix, none = matrix_of(self.focal_px, self.centre_px), np.zeros(3)
         return cv2.projectPoints(points, none, none, matrix, np.array(self.coefficients))[0][:, 0].astype(np.float64)
@@ -102,7 +103,8 @@ class FisheyeModel(CameraModel):
     name = "fisheye"
     counts = (4,)
 
-    def __call__(self, rays: Floats) -> Floats:  # noqa: D102
+    def __call__(self, rays: Floats) -> Floats:
+        """Pixels of rays, both (N, 2)."""
         points, matrix = np.ascontiguousarray(rays)[:, None], matrix_of(self.focal_px, self.centre_px)
         return cv2.fisheye.distortPoints(points, matrix, np.array(self.coefficients))[:, 0].astype(np.float64)
 

@@ -106,6 +106,8 @@ class Undistortion:
             (lens, stored), left = model_from_json(value["lens"]), pinhole_from_json(value["leaves"])
         except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"lens: {type(error).__name__}: {error}") from None
+        if left.width > stored[0] or left.height > stored[1]:
+            raise ValueError("lens: it leaves larger pictures than it is given")
         corners = np.array([(x, y) for x in (0.0, left.width - 1) for y in (0.0, left.height - 1)])
         seen = lens((corners - left.centre_px) / left.focal_px)
         if not ((seen > -1) & (seen < stored)).all():

@@ -14,6 +14,7 @@ from recorded import Recording, record
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
+from mambaloc.importing.importer import import_scene
 from mambaloc.rendering import Room, embedded_room, embedded_walk, render
 
 
@@ -35,6 +36,16 @@ def rendered_once(made_once, request) -> Rendered:
         _write_rendered(request.getfixturevalue("room"), Rendered(folder, walk, matrix, coefficients))
 
     return Rendered(made_once("rendered", make), walk, matrix, coefficients)
+
+
+@pytest.fixture(scope="session")
+def imported_once(rendered_once, made_once) -> Path:
+    """The same as a scene's folder; read only."""
+
+    def make(folder: Path) -> None:
+        import_scene(rendered_once.folder, folder / "room", command="python tools/import_scene.py room")
+
+    return made_once("imported", make) / "room"
 
 
 def _write_rendered(room: Room, rendered: Rendered) -> None:

@@ -23,14 +23,10 @@ from mambaloc.mapping.posed import with_cameras
 from mambaloc.rendering import render
 
 
-@pytest.fixture(scope="session")
-def scene(rendered_once, made_once):
+@pytest.fixture
+def scene(imported_once):
     """The capture as a scene; read only."""
-
-    def make(folder):
-        import_scene(rendered_once.folder, folder / "room", command="python tools/import_scene.py room")
-
-    return made_once("imported", make) / "room"
+    return imported_once
 
 
 # --- the scene -------------------------------------------------------------------------------------------------------

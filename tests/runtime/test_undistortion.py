@@ -153,6 +153,7 @@ def test_a_contract_names_the_function_and_what_it_leaves():
         (("leaves", "focal_px"), [275, 0]),
         (("leaves", "focal_px"), [27.5, 26.9]),  # looks past the stored picture
         (("leaves", "centre_px"), [1e9, 0]),
+        (("leaves", "width"), 321),  # larger than what is stored
         (("leaves", "height"), "x"),
     ],
 )
