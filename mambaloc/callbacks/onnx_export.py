@@ -50,5 +50,7 @@ class OnnxExport(L.Callback):
             uncertainty, told = fit_uncertainty(system, data), "tells how sure it is"
         except InputError as error:
             uncertainty, told = None, f"tells no uncertainty: {error}"
-        parity = export_onnx(system, path, contract_of(system, data.hparams, uncertainty, data.world), uncertainty)
+        parity = export_onnx(
+            system, path, contract_of(system, data.hparams, uncertainty, data.world, data.undistortion), uncertainty
+        )
         print(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch; {told}")

@@ -31,11 +31,17 @@ def main() -> None:
         help="trajectory to write, TUM format; of a ROS bag, another bag: FILE.bag of ROS 1, or a folder of ROS 2",
     )
     parser.add_argument("--filter", choices=FILTERS, help="steady a video's poses: from those before, or from all")
-    parser.add_argument(
+    cameras = parser.add_mutually_exclusive_group()
+    cameras.add_argument(
         "--intrinsics",
         type=pinhole_matrix,
         metavar="FX,FY,CX,CY",
         help="of the frames, in pixels; the training camera's unless given",
+    )
+    cameras.add_argument(
+        "--distorted",
+        action="store_true",
+        help="frames are as the training camera stores them, and are undistorted by its lens",
     )
     parser.add_argument(
         "--counts",
@@ -59,13 +65,18 @@ def main() -> None:
         return
     if args.topic or args.world_frame or args.pose_frame:
         raise InputError(f"{args.source}: is no ROS bag. Leave --topic, --world-frame and --pose-frame out.")
-    print(f"{args.out}: {follow(localiser, args.source, args.out, args.filter, args.intrinsics, args.counts)}")
+    followed = follow(
+        localiser, args.source, args.out, args.filter, args.intrinsics, args.counts, is_distorted=args.distorted
+    )
+    print(f"{args.out}: {followed}")
 
 
 def _localise_bag(localiser: Localiser, args: Namespace) -> None:
     from mambaloc.bags.localising import localise_bag  # only here: an extra
     from mambaloc.importing.formats.ros_bag import straightener
 
+    if args.distorted:
+        raise InputError("--distorted: a bag says how its camera distorts, in CameraInfo. Leave it out.")
     if args.filter is not None:
         raise InputError(f"--filter {args.filter}: a bag's poses are for a robot's own filter, as found. Leave it out.")
     if args.out.suffix == ".tum":

@@ -16,6 +16,7 @@ from mambaloc.data.frames import Cameras, Frames, plain_name
 from mambaloc.data.nvm import NVM_FILE, read_nvm_cameras
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import LARGEST_SIDE_PX, read_image
+from mambaloc.runtime.undistortion import Undistortion
 
 Floats = NDArray[np.float64]
 Size = tuple[int, int]
@@ -93,6 +94,31 @@ def known_or_assumed_cameras(dataset: str, folder: Path, frames: Frames) -> Came
 def assumed_intrinsics(size: Size) -> Floats:
     """The usual camera's pinhole matrix, (3, 3), for pictures of a size (width, height)."""
     return _centred(ASSUMED_FOCAL * max(size), size)
+
+
+def undistortion_of(folder: Path) -> Undistortion:
+    """How a scene's training pictures were made of what their camera stored, where all are of one.
+
+    Raises:
+        InputError: where ``scene.json`` says of it what cannot be read.
+    """
+    if not is_captured(folder):
+        return Undistortion(unknown="their scene was not imported")
+    names = {row.camera for row in read_rows(folder) if row.split == "train"}
+    if len(names) != 1:
+        return Undistortion(unknown=f"they are of {len(names)} cameras")
+    told = read_scene(folder).get("cameras")
+    camera = told.get(*names) if isinstance(told, dict) else None
+    if not isinstance(camera, dict):
+        return Undistortion(unknown="their scene does not describe their camera")
+    if "adjusted_from" in camera:
+        return Undistortion(unknown="its focal length was adjusted after they were undistorted")
+    if "lens" not in camera:
+        return Undistortion(unknown="they were imported as they are, as those of a pinhole")
+    try:
+        return Undistortion.from_json({"lens": camera["lens"], "leaves": camera})
+    except ValueError as error:
+        raise InputError(f"{folder / SCENE_FILE}: {error}. Correct it, or import the scene again.") from None
 
 
 def _centred(focal_px: float, size: Size) -> Floats:

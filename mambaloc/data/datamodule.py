@@ -15,6 +15,7 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from mambaloc import provenance
 from mambaloc.data.augmentation import Jitter, RandomCrop, RandomRotation, View, centered, draw_uniforms
+from mambaloc.data.cameras import undistortion_of
 from mambaloc.data.datasets.capture import world_of
 from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.frames import Frames, OnBadFrame, Split
@@ -24,6 +25,7 @@ from mambaloc.data.views import FramesAndViews, MixedSampler, SceneViews, ViewDe
 from mambaloc.errors import InputError
 from mambaloc.geometry import cropped_intrinsics
 from mambaloc.images import center_corner
+from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
 from mambaloc.types import PoseBatch
 
@@ -132,6 +134,11 @@ class PoseDataModule(L.LightningDataModule):
     def world(self) -> World:
         """Where the scene's frame lies in the world of the data that it was made of."""
         return world_of(self.folder)
+
+    @property
+    def undistortion(self) -> Undistortion:
+        """How the scene's pictures were made of what their camera stored."""
+        return undistortion_of(self.folder)
 
     def setup(self, stage: str) -> None:
         """Read and decode what a stage needs; every process may, since the cache is built by one of them."""

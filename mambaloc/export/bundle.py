@@ -124,7 +124,7 @@ def _write_models(
     raw_input: bool,
     uncertainty: UncertaintyHead | None,
 ) -> tuple[Contract, EightBit | None]:
-    plain = contract_of(system, data.hparams, uncertainty, data.world)
+    plain = contract_of(system, data.hparams, uncertainty, data.world, data.undistortion)
     contract = replace(plain, preprocessing=replace(plain.preprocessing, in_model=raw_input))
     network = folder / MODEL_FILES["onnx"]
     export_onnx(system, network, plain, uncertainty)

@@ -24,6 +24,7 @@ from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork, PositionScale
 from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, METADATA_KEY, Contract, Preprocessing
+from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
 from mambaloc.uncertainty import UncertaintyHead, pooled
 
@@ -117,6 +118,7 @@ def contract_of(
     data: Mapping[str, Any],
     uncertainty: UncertaintyHead | None = None,
     world: World | None = None,
+    undistortion: Undistortion | None = None,
 ) -> Contract:
     """Say what a system's exported network promises.
 
@@ -125,6 +127,7 @@ def contract_of(
         data: hyperparameters of the data module that it was trained with.
         uncertainty: that the model will tell.
         world: of the scene; without a shift unless given.
+        undistortion: of the scene's pictures; with no lens known unless given.
     """
     preprocessing = Preprocessing(data["short_side"], system.image_size)
     scene = f"{data['dataset']}/{data['scene']}"
@@ -142,6 +145,7 @@ def contract_of(
         radii,
         intrinsics,
         world=world or World(),
+        undistortion=undistortion or Undistortion(),
     )
 
 

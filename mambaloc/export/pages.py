@@ -10,6 +10,7 @@ from typing import Any
 from mambaloc.data.datasets.registry import licence_of_weights
 from mambaloc.runtime.contract import Contract
 from mambaloc.runtime.maps import MAP_FILE, SparseMap
+from mambaloc.runtime.undistortion import Undistortion
 
 TARGETS = ("android", "ios", "react_native", "web", "pc")
 """Kinds of app that there is a page on integration for."""
@@ -36,7 +37,7 @@ def write_pages(
     for name, text in (
         ("README.md", _card(contract, models, sparse_map, is_native)),
         ("LICENSE.txt", _licence(dataset)),
-        ("INTEGRATION.md", page),
+        ("INTEGRATION.md", f"{page}\n{_pictures(contract.undistortion)}"),
     ):
         (folder / name).write_text(text, encoding="utf-8")
     if sparse_map is not None and is_native:
@@ -105,6 +106,29 @@ def _lens(contract: Contract) -> str:
 Pictures of any camera and shape are localised if their intrinsics are known. The models take them as a required input,
 which `INTEGRATION.md` fills in with the training camera's, `intrinsics` in `contract.json`, where they are not.
 
+"""
+
+
+def _pictures(undistortion: Undistortion) -> str:
+    """What pictures must be, and by which lens the camera's own become so."""
+    must = "Pictures must be without lens distortion, as the training pictures are taken to be."
+    lens, left = undistortion.lens, undistortion.leaves
+    if lens is None or left is None:
+        return f"""## Pictures
+
+{must} The lens of their camera is not known here:
+{undistortion.unknown}.
+"""
+    (width, height), (fx, fy), (cx, cy) = undistortion.stored, left.focal_px, left.centre_px
+    return f"""## Pictures
+
+{must} Their camera stored these
+as {width}x{height}, through a lens of OpenCV's {lens.name} model: `lens` of `undistortion` in `contract.json`.
+Undistorting leaves {left.width}x{left.height} with the pinhole matrix
+{fx:.2f} 0 {cx:.2f}, 0 {fy:.2f} {cy:.2f}, 0 0 1, which is `leaves` there. Pictures of the same camera need the same,
+resized ones with both scaled: in Python, `Localiser.localise(picture, is_distorted=True)` and
+`mambaloc localize --distorted`; in an app, OpenCV's `initUndistortRectifyMap` (for a fisheye,
+`fisheye::initUndistortRectifyMap`) and `remap`, as `function` there says.
 """
 
 

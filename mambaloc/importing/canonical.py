@@ -19,6 +19,7 @@ from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.checks.agreement import Agreement
 from mambaloc.importing.checks.findings import Finding, Verdict
 from mambaloc.importing.splits.selection import RULE, Chosen, Proposal
+from mambaloc.runtime.camera_models import CameraModel, model_to_json, numbers_to_json
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
 ADJUSTED_FILE = "frames_adjusted.csv"
@@ -155,17 +156,15 @@ def _adjusted(camera: str) -> str:
 
 
 def _described(camera: Camera, lens: Camera) -> dict[str, Any]:
-    told: dict[str, Any] = {
-        "width": camera.width,
-        "height": camera.height,
-        "focal_px": list(camera.focal_px),
-        "centre_px": list(camera.centre_px),
-    }
+    told = numbers_to_json(camera.size, camera.focal_px, camera.centre_px)
     if lens.distorted is None:
-        is_whole = (lens.width, lens.height) == (camera.width, camera.height)
-        images = "as they were" if is_whole else f"the middle of {lens.width}x{lens.height}"
+        images = "as they were" if lens.size == camera.size else f"the middle of {lens.width}x{lens.height}"
         return {**told, "images": f"{images}: the camera is a pinhole", "model": lens.model}
-    was = {"model": lens.model, "focal_px": list(lens.focal_px), "centre_px": list(lens.centre_px)}
+    was = {"model": lens.model, **numbers_to_json(lens.size, lens.focal_px, lens.centre_px)}
+    if isinstance(lens.distorted, CameraModel):
+        was |= model_to_json(lens.distorted, lens.size)
+    else:
+        was |= {"opencv": None, "unknown": f"its model, {lens.model}, is not one of OpenCV's"}
     zoom = camera.focal_px[0] / lens.focal_px[0]
     return {**told, "images": f"distortion removed; zoomed by {zoom:.4f}, so that no border is black", "lens": was}
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.data.tracks import Tracks
+from mambaloc.runtime.camera_models import Pinhole
 from mambaloc.runtime.world import World
 
 Unit = Literal["metre", "unknown"]
@@ -20,22 +21,15 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Camera:
-    """Intrinsics of a capture's camera, in pixels of its images; the centre of the top-left pixel is (0, 0).
+class Camera(Pinhole):
+    """A capture's camera, in pixels of its images; the centre of the top-left pixel is (0, 0).
 
     Args:
-        width: of its images.
-        height: likewise.
-        focal_px: along x and y.
-        centre_px: principal point, x and y.
-        distorted: pixels (N, 2) of rays (N, 2), which are ``x / z`` and ``y / z``; None for a pinhole.
+        distorted: pixels (N, 2) of rays (N, 2), which are ``x / z`` and ``y / z``; None for a pinhole. Only a
+            :class:`~mambaloc.runtime.camera_models.CameraModel` can be kept, for pictures to localise.
         model: what the format calls it.
     """
 
-    width: int
-    height: int
-    focal_px: tuple[float, float]
-    centre_px: tuple[float, float]
     distorted: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     model: str = "pinhole"
 
@@ -48,11 +42,14 @@ class Depth:
         files: of each image the 16-bit PNG, or None; 0 and 65535 are pixels without a measurement.
         intrinsics: (3, 3), in pixels of depth frames; another lens than the images' where the sensor has one.
         step: how far one more in a file is, in the capture's unit.
+        confidence: of each depth frame the 8-bit PNG of its size, or None; pixels that are 0 there are left out. Empty
+            where the format has none.
     """
 
     files: tuple[Path | None, ...]
     intrinsics: NDArray[np.float64]
     step: float = 0.001
+    confidence: tuple[Path | None, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from mambaloc.mapping.structure import Structure, recover_structure
 from mambaloc.runtime.maps.drift import fit_drift
 from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.sparse_map import SparseMap
+from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ class PosedFrames:
     Args:
         tracks: points that structure from motion found with these poses, and where the frames see them.
         world: where the scene's frame lies in the world of the data that it was made of.
+        undistortion: how the images were made of what their camera stored.
     """
 
     images: Sequence[Path | Image]
@@ -63,6 +65,7 @@ class PosedFrames:
     world_from_cam: NDArray[np.float64]
     tracks: Tracks | None = None
     world: World = field(default_factory=World)
+    undistortion: Undistortion = field(default_factory=Undistortion)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -75,6 +78,7 @@ class PosedFrames:
             self.world_from_cam[rows],
             self.tracks and self.tracks.of_frames(rows),
             self.world,
+            self.undistortion,
         )
 
 
@@ -149,6 +153,7 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
         np.zeros((0, 6)) if tracks else drift,
         nugget,
         world=frames.world,
+        undistortion=frames.undistortion,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mambaloc.data.cameras import frame_intrinsics
+from mambaloc.data.cameras import frame_intrinsics, undistortion_of
 from mambaloc.data.datasets.capture import is_captured, world_of
 from mambaloc.data.datasets.registry import DATASETS, locate, scene_folder
 from mambaloc.data.frames import BadFrames, Frames, Split
@@ -40,4 +40,4 @@ def with_cameras(dataset: str, folder: Path, frames: Frames) -> PosedFrames:
     intrinsics = frame_intrinsics(dataset, folder, frames)
     poses = rigid_transforms(matrix_from_quaternion(frames.quaternion), frames.position_m)
     tracks = tracks_of_frames(folder, frames) if is_captured(folder) else None
-    return PosedFrames(frames.image_paths, intrinsics, poses, tracks, world_of(folder))
+    return PosedFrames(frames.image_paths, intrinsics, poses, tracks, world_of(folder), undistortion_of(folder))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mambaloc.errors import InputError
 from mambaloc.images import Image, center_corner, center_cropped, resized, resized_size
 from mambaloc.runtime.maps.features import check_intrinsics
+from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
 
 VERSION = 1
@@ -87,6 +88,7 @@ class Contract:
             it is fed where the camera is unknown.
         pose: frame, units and order of its outputs.
         world: where the scene's frame lies in that of the data it was made of.
+        undistortion: how the training pictures were made of what their camera stored.
     """
 
     model: str
@@ -98,6 +100,7 @@ class Contract:
     intrinsics: tuple[tuple[float, float, float], ...] | None = None
     pose: str = POSE
     world: World = field(default_factory=World)
+    undistortion: Undistortion = field(default_factory=Undistortion)
 
     @property
     def outputs(self) -> dict[str, list[str | int]]:
@@ -131,7 +134,7 @@ class Contract:
             "range": [0, 255] if raw else [0, 1],
             "colour": "RGB",
         }
-        inputs: dict[str, Any] = {"input": tensor}
+        inputs: dict[str, Any] = {"undistortion": self.undistortion.to_json(), "input": tensor}
         if self.intrinsics is not None:
             inputs["intrinsics_input"] = {
                 "name": INTRINSICS_INPUT,
@@ -171,6 +174,7 @@ class Contract:
                 None if data.get("intrinsics") is None else _matrix(data["intrinsics"], (width, height)),
                 str(data["pose"]),
                 World.from_json(data.get("world")),
+                Undistortion.from_json(data.get("undistortion")),
             )
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             reason = f"{type(error).__name__}: {error}"

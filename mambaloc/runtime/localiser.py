@@ -17,6 +17,7 @@ from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
 from mambaloc.runtime.network import Network
 from mambaloc.runtime.sources import SourceFrame, frames_of
+from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
 
 
@@ -46,6 +47,7 @@ class Localiser:
         self._network = None if is_map else Network(_model_file(path), threads)
         found = SparseMap.load(path) if is_map else _map_beside(path, sparse_map)
         self._map = None if found is None else MapLocaliser(found)
+        self._path = path
 
     @property
     def contract(self) -> Contract | None:
@@ -68,28 +70,43 @@ class Localiser:
         return self._place.world
 
     @property
+    def undistortion(self) -> Undistortion:
+        """How the training pictures were made of what their camera stored: as the network has it, or else the map."""
+        told = [each.undistortion for each in (self.contract, self.sparse_map) if each is not None]
+        return next((each for each in told if each.lens is not None), told[0])
+
+    @property
     def _place(self) -> Contract | SparseMap:
         if self._network is not None:
             return self._network.contract
         assert self._map is not None  # one of the two is there
         return self._map.map
 
-    def localise(self, image: str | Path | Image, intrinsics: ArrayLike | None = None) -> Localisation:
+    def localise(
+        self, image: str | Path | Image, intrinsics: ArrayLike | None = None, is_distorted: bool = False
+    ) -> Localisation:
         """Localise one image, in the world of the data that the scene was made of.
 
         Args:
-            image: a file; or RGB (H, W, 3), or grey (H, W), ``uint8``, of any size.
+            image: a file; or RGB (H, W, 3), or grey (H, W), ``uint8``, of any size, without distortion.
             intrinsics: (3, 3) pinhole matrix in its pixels, for the map, and for a network that takes intrinsics.
                 Unless given, the training camera's: the map's own, where the image has its shape, and the network's.
+            is_distorted: the image is as the training camera stores it, whole or resized, and is undistorted by its
+                lens, which says the intrinsics.
 
         Raises:
             InputError: for a file that is missing or no whole image, or an array of another kind; for an image that
                 does not hold the network's crop, unless the network is given its intrinsics; for intrinsics that cannot
                 be the image's, where the network takes them or there is a map alone; and, in a map alone, for an image
-                of another shape without them.
+                of another shape without them; for a distorted image where no lens is known, or of another shape than
+                its, or with intrinsics.
         """
         rgb = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
         start = time.perf_counter()
+        if is_distorted:
+            if intrinsics is not None:
+                raise InputError("intrinsics: of distorted pictures, the lens says them. Leave out one of the two.")
+            rgb, intrinsics = self.undistortion.apply(rgb, str(self._path))
         network = None if self._network is None else self._network.localise(rgb, intrinsics)
         in_map = self._localise_in_map(rgb, intrinsics, network)
         if in_map is not None:
@@ -100,19 +117,23 @@ class Localiser:
         return replace(answer, position_m=position_m, latency_s=time.perf_counter() - start)
 
     def localise_each(
-        self, source: str | Path | Iterable[SourceFrame], intrinsics: ArrayLike | None = None
+        self,
+        source: str | Path | Iterable[SourceFrame],
+        intrinsics: ArrayLike | None = None,
+        is_distorted: bool = False,
     ) -> Iterator[tuple[float, Localisation]]:
         """Localise a source's frames one after another, each with its time in seconds since the first.
 
         Args:
             source: as :func:`~mambaloc.runtime.sources.frames_of` takes it, or the frames that it gives.
             intrinsics: of every frame, as :meth:`localise` takes them.
+            is_distorted: likewise.
 
         Raises:
             InputError: where there is no such source, or as :meth:`localise`.
         """
         for frame in frames_of(source)[0] if isinstance(source, str | Path) else source:
-            yield frame.time_s, self.localise(frame.image, intrinsics)
+            yield frame.time_s, self.localise(frame.image, intrinsics, is_distorted)
 
     def _localise_in_map(
         self, rgb: Image, intrinsics: ArrayLike | None, network: Localisation | None

@@ -70,6 +70,7 @@ def follow(
     filtering: str | None = None,
     intrinsics: ArrayLike | None = None,
     counts: Counts | None = None,
+    is_distorted: bool = False,
 ) -> Followed:
     """Localise every frame of a source with a progress bar on stderr, and write a TUM trajectory.
 
@@ -83,6 +84,7 @@ def follow(
         filtering: one of :data:`FILTERS`; poses are written as found unless given.
         intrinsics: of every frame, (3, 3) in pixels; the training camera's unless given.
         counts: black and white of 16-bit pictures, as the scene's were.
+        is_distorted: frames are as the training camera stores them, and are undistorted by its lens.
 
     Raises:
         InputError: where there is no such source, it holds no frame, one cannot be localised, none has a pose, or
@@ -97,7 +99,7 @@ def follow(
     outliers = None
     try:
         watched = track(frames, "Localising", count, console=console, transient=True)
-        for time_s, pose in localiser.localise_each(watched, intrinsics):
+        for time_s, pose in localiser.localise_each(watched, intrinsics, is_distorted):
             found.append((time_s, pose))  # at once, so that Ctrl-C leaves as many times as poses
     except KeyboardInterrupt:
         pass

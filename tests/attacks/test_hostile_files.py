@@ -289,6 +289,17 @@ def test_contracts(tmp_path, fed):
         "trained": {"commit": "abc"},
         "weights_sha256": "0" * 64,
         "pose": "world_from_cam",
+        "undistortion": {
+            "lens": {
+                "opencv": "fisheye",
+                "width": 64,
+                "height": 48,
+                "focal_px": [50, 50],
+                "centre_px": [31, 24],
+                "coefficients": [0.02, 0, 0, 0],
+            },
+            "leaves": {"width": 64, "height": 48, "focal_px": [55, 55], "centre_px": [31, 24]},
+        },
     }
     path = tmp_path / "contract.json"
     path.write_text(json.dumps(said, indent=1))

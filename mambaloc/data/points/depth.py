@@ -29,6 +29,8 @@ _OFFICIAL_INTRINSICS = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])
 _OFFICIAL_SIZE = (640, 480)
 NO_DEPTH_MM = (0, 65535)
 """What a depth frame has at pixels without a measurement."""
+PNG_END = b"IEND\xaeB`\x82"
+"""Last bytes of a whole PNG: OpenCV fills what a truncated file lacks with zeros and says nothing."""
 
 
 def depth_path(image: Path) -> Path:
@@ -80,8 +82,7 @@ def read_depth_mm(path: Path) -> NDArray[np.uint16]:
     """
     try:
         data = path.read_bytes()
-        # OpenCV fills what a truncated file lacks with zeros and says nothing.
-        whole = data.endswith(b"IEND\xaeB`\x82")
+        whole = data.endswith(PNG_END)
         depth_mm = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
     except (OSError, cv2.error):
         depth_mm = None

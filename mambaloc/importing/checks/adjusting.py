@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.importing.capture import Capture, Depth
+from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.depth import sampled
 from mambaloc.importing.checks.matching import searched, shown
 from mambaloc.mapping.adjusting import moves
@@ -82,7 +82,7 @@ def adjust_poses(capture: Capture) -> Adjusted:
         matches = list(shown(of_pairs, "Matching pictures", len(pairs)))
     depth = None
     if capture.depth is not None:
-        depth = [_depth(capture.depth, row, each) for row, each in zip(rows.tolist(), features, strict=True)]
+        depth = [sampled(capture.depth, row, each.rays) for row, each in zip(rows.tolist(), features, strict=True)]
     names, camera = _cameras(capture, rows)
     structure = recover_structure(features, given, pairs, matches, np.random.default_rng(0), depth, camera)
     if len(structure.points_m) < _LEAST_POINTS:
@@ -121,11 +121,6 @@ def _focal(
         ideal = lens.undistort(np.concatenate(rays))
         found[name] = float((lens.distort(ideal) * ideal).sum() / max((ideal**2).sum(), 1e-12))
     return found
-
-
-def _depth(depth: Depth, row: int, features: Features) -> Floats:
-    file = depth.files[row]
-    return np.full(len(features), np.nan) if file is None else sampled(depth, file, features.rays)
 
 
 def _carried(capture: Capture, rows: Indices, adjusted: Floats) -> Floats:

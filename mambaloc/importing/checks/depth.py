@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.data.points.depth import NO_DEPTH_MM, read_depth_mm
+from mambaloc.data.points.depth import NO_DEPTH_MM, PNG_END, read_depth_mm
+from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture, Depth
 from mambaloc.importing.checks.epipolar import apart_of
 from mambaloc.importing.checks.matching import Matches
@@ -104,23 +105,46 @@ def depth_of_matches(depth: Depth, matches: Matches) -> Floats:
     found = np.full(len(matches.pair), np.nan)
     first = matches.pairs[matches.pair, 0]
     for row in np.unique(first).tolist():
-        if (file := depth.files[row]) is not None:
-            found[first == row] = sampled(depth, file, matches.first[first == row])
+        found[first == row] = sampled(depth, row, matches.first[first == row])
     return found
 
 
-def sampled(depth: Depth, file: Path, rays: Floats) -> Floats:
-    """What a depth frame measured along rays (M, 2), in the capture's unit, (M,); NaN where nothing.
+def sampled(depth: Depth, row: int, rays: Floats) -> Floats:
+    """What an image's depth frame measured along rays (M, 2), in the capture's unit, (M,); NaN where nothing to trust.
 
     Raises:
-        InputError: where it is damaged.
+        InputError: where it, or its confidence, is damaged.
     """
+    if (file := depth.files[row]) is None:
+        return np.full(len(rays), np.nan)
     steps = read_depth_mm(file)
+    if depth.confidence and (sure := depth.confidence[row]) is not None:
+        steps = np.where(_confidence(sure, steps.shape) == 0, 0, steps)
     pixels = np.rint(rays @ depth.intrinsics[:2, :2].T + depth.intrinsics[:2, 2]).astype(int)
     is_inside = np.all((pixels >= 0) & (pixels < steps.shape[::-1]), axis=1)
     x, y = np.where(is_inside[:, None], pixels, 0).T
     is_measured = is_inside & np.isin(steps[y, x], NO_DEPTH_MM, invert=True)
     return np.where(is_measured, depth.step * steps[y, x], np.nan)
+
+
+def _confidence(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Confidence of each pixel of a depth frame, (H, W).
+
+    Raises:
+        InputError: where it is not a whole PNG of 8 bits and that shape.
+    """
+    try:
+        data = path.read_bytes()
+        whole = data.endswith(PNG_END)
+        found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
+    except (OSError, cv2.error):
+        found = None
+    if found is None or found.dtype != np.uint8 or found.shape != shape:
+        raise InputError(
+            f"{path}: is no whole 8-bit PNG of one channel and the size of its depth frame, {shape[1]}x{shape[0]}. "
+            "Copy the recording again, or remove the file to trust all of that frame's depth."
+        )
+    return found  # type: ignore[return-value]
 
 
 def _off_px(world_from_cam: Floats, matches: Matches, depth: Floats, focal: float, turn: float) -> Floats:

@@ -13,7 +13,7 @@ from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.findings import Finding
 from mambaloc.importing.motion import Motion, quaternions, sides_of
 from mambaloc.importing.undistort.decoding import Decoding
-from mambaloc.importing.undistort.fitting import is_same_shape
+from mambaloc.runtime.camera_models import is_same_shape
 from mambaloc.runtime.rotations import is_rotation
 
 LEAST_FRAMES = 20

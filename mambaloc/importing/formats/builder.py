@@ -38,6 +38,7 @@ class Posed:
     time_s: float | None = None
     split: str | None = None
     depth: Path | None = None
+    confidence: Path | None = None
     fault: str = ""
 
 
@@ -108,6 +109,7 @@ def build_capture(
     known = {*used, *marked}
     rank = {name: at for at, name in enumerate(dict.fromkeys(each.sequence for each in posed))}
     ordered = sorted(posed, key=lambda each: rank[each.sequence])
+    depth, confidence = tuple(each.depth for each in ordered), tuple(each.confidence for each in ordered)
     cameras_of = [each.camera for each in ordered if each.camera is not None]
     times = [each.time_s for each in ordered if each.time_s is not None]
     splits = [each.split for each in ordered if each.split is not None]
@@ -125,7 +127,7 @@ def build_capture(
         poses_without_image=tuple(missing),
         images_without_pose=tuple(image for image in dict.fromkeys(beside) if image not in known),
         left_out={str(image): rule for image, rule in marked.items()},
-        depth=None if depth_camera is None else Depth(tuple(each.depth for each in ordered), depth_camera),
+        depth=None if depth_camera is None else Depth(depth, depth_camera, confidence=confidence),
         split_concern=split_concern or (_NONE_LISTED if splits and set(splits) == {"unused"} else ""),
     )
 

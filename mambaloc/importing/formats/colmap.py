@@ -26,11 +26,14 @@ from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
 from mambaloc.importing.formats.finding import SMALLER, Found, count_there, find_pictures
 from mambaloc.importing.formats.parsing import folder_name, pictures_beside
+from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 from mambaloc.text import natural
 
 _ROOTS = ("sparse", ".", "colmap/sparse")
 _NAMED = 3  # other models
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+_OPENCV = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_FISHEYES = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 
 def is_colmap(source: Path) -> bool:
@@ -155,18 +158,22 @@ def _camera(camera: Any, path: Path) -> Camera:
             "Make smaller images, and reconstruct from these."
         )
     model = str(camera.model_name)
-    return Camera(
-        int(camera.width),
-        int(camera.height),
-        (float(camera.focal_length_x), float(camera.focal_length_y)),
-        (float(camera.principal_point_x) - CORNER_PX, float(camera.principal_point_y) - CORNER_PX),
-        None if model in _PINHOLES else _distorted(camera),
-        model,
-    )
+    focal_px, centre_px = _pinhole(camera)
+    lens = None if model in _PINHOLES else _lens(camera)
+    return Camera(int(camera.width), int(camera.height), focal_px, centre_px, lens, model)
 
 
-def _distorted(camera: Any) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Pixels of rays by COLMAP's model; NaN for rays that it does not see."""
+def _pinhole(camera: Any) -> tuple[tuple[float, float], tuple[float, float]]:
+    focal_px = float(camera.focal_length_x), float(camera.focal_length_y)
+    return focal_px, (float(camera.principal_point_x) - CORNER_PX, float(camera.principal_point_y) - CORNER_PX)
+
+
+def _lens(camera: Any) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """The same lens in OpenCV's terms, where it has some; or else pycolmap's, NaN for rays that it does not see."""
+    told = [float(camera.params[at]) for at in camera.extra_params_idxs()]
+    for model, names in ((OpenCVModel, _OPENCV), (FisheyeModel, _FISHEYES)):
+        if camera.model_name in names:
+            return model(*_pinhole(camera), told + [0.0] * (min(model.counts) - len(told)))
 
     def distorted(rays: NDArray[np.float64]) -> NDArray[np.float64]:
         points: NDArray[np.float64] = np.column_stack([rays, np.ones(len(rays))])

@@ -25,15 +25,15 @@ from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, f
 from mambaloc.importing.formats.finding import find_pictures
 from mambaloc.importing.formats.parsing import Table, array_of, as_numbers, folder_name, pictures_beside, read_text
 from mambaloc.importing.formats.timing import by_time, stamps_of
-from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
+from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0")
 _POSE = ("p_rs_r_x", "p_rs_r_y", "p_rs_r_z", "q_rs_w", "q_rs_x", "q_rs_y", "q_rs_z")
 _LENSES = {
-    "radial-tangential": (opencv_lens, (4, 5)),
-    "radtan": (opencv_lens, (4, 5)),  # Kalibr's word
-    "plumb_bob": (opencv_lens, (4, 5)),  # ROS's
-    "equidistant": (opencv_fisheye, (4,)),
+    "radial-tangential": (OpenCVModel, (4, 5)),
+    "radtan": (OpenCVModel, (4, 5)),  # Kalibr's word
+    "plumb_bob": (OpenCVModel, (4, 5)),  # ROS's
+    "equidistant": (FisheyeModel, (4,)),
 }
 """How rays are distorted, by the file's word, with how many coefficients."""
 _OPENCVS_DIRECTIVE = "%YAML:1.0"

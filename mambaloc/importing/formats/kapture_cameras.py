@@ -16,7 +16,7 @@ from mambaloc.images import CORNER_PX
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.formats.builder import pinhole
 from mambaloc.importing.formats.parsing import as_numbers
-from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
+from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 
 UNKNOWN = "UNKNOWN_CAMERA"
 """The model of a camera that is not calibrated."""
@@ -62,6 +62,6 @@ def _camera(told: tuple[str, ...], where: str) -> Camera:
     is_fisheye = model.endswith("FISHEYE")
     if not is_fisheye and not coefficients.any():
         return camera
-    lens = opencv_fisheye if is_fisheye else opencv_lens
+    lens = FisheyeModel if is_fisheye else OpenCVModel
     padded = [*coefficients.tolist(), *[0.0] * (4 - count)]
     return replace(camera, distorted=lens(camera.focal_px, camera.centre_px, padded), model=model)

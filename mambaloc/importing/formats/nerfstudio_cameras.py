@@ -14,7 +14,7 @@ from typing import Any
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX, stored_size
 from mambaloc.importing.capture import Camera
-from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
+from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 KEYS = (
@@ -116,8 +116,8 @@ def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
         "OPENCV_FISHEYE" if is_fisheye else "OPENCV" if any(coefficients) else "PINHOLE"
     )
     if model == "OPENCV_FISHEYE":
-        lens = opencv_fisheye(camera.focal_px, camera.centre_px, (k1, k2, k3, k4))
-        return replace(camera, distorted=lens, model=model)
+        fisheye = FisheyeModel(camera.focal_px, camera.centre_px, (k1, k2, k3, k4))
+        return replace(camera, distorted=fisheye, model=model)
     if model not in _BROWN:
         raise InputError(
             f"{where}: camera_model {str(model)[:40]!r} is not read, only {', '.join(_BROWN)} and OPENCV_FISHEYE; "
@@ -127,7 +127,7 @@ def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
         raise InputError(f"{where}: k4 is {k4:g}, which OpenCV's lens has not; give camera_model OPENCV_FISHEYE, or 0")
     if not any(coefficients):
         return replace(camera, model=model)
-    lens = opencv_lens(camera.focal_px, camera.centre_px, (k1, k2, p1, p2, k3))
+    lens = OpenCVModel(camera.focal_px, camera.centre_px, (k1, k2, p1, p2, k3))
     return replace(camera, distorted=lens, model=model)
 
 

@@ -17,6 +17,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mambaloc.runtime.camera_models import OpenCVModel
+
 Pixels = NDArray[np.float64]
 
 
@@ -40,6 +42,8 @@ def photogrammetric_lens(
     """
     k1, k2, k3, k4 = radial
     p1, p2, p3, p4 = tangential
+    if not is_fisheye and not any((k4, p3, p4, *affinity_px)):
+        return OpenCVModel((focal_px, focal_px), centre_px, (k1, k2, p2, p1, k3))  # which can be kept for queries
 
     def distorted(rays: Pixels) -> Pixels:
         if is_fisheye:

@@ -31,18 +31,19 @@ from mambaloc.importing.film import digest_of
 from mambaloc.importing.formats.builder import Posed, build_capture, pinhole
 from mambaloc.importing.formats.parsing import folder_name
 from mambaloc.importing.frame_choice import choose_frames
-from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens
 from mambaloc.importing.undistort.fitting import FittedCameras
+from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 from mambaloc.runtime.sources import SourceFrame
+from mambaloc.runtime.undistortion import undistorted
 from mambaloc.user_cache import made_once
 
 _VERSION = 1  # of what is kept; another one is made again
 _NOTE, _POSES = "note.json", "poses.npy"
 _LENSES = {
-    "plumb_bob": (opencv_lens, (4, 5)),
-    "rational_polynomial": (opencv_lens, (8, 12, 14)),
-    "equidistant": (opencv_fisheye, (4,)),
-    "fisheye": (opencv_fisheye, (4,)),
+    "plumb_bob": (OpenCVModel, (4, 5)),
+    "rational_polynomial": (OpenCVModel, (8, 12, 14)),
+    "equidistant": (FisheyeModel, (4,)),
+    "fisheye": (FisheyeModel, (4,)),
 }
 """Models of distortion, and how many coefficients each may have."""
 
@@ -122,7 +123,7 @@ def camera_from(told: BagCamera, where: str) -> Camera:
     camera = pinhole(told.size, (fx, fy), (cx, cy), where)
     if not told.coefficients:
         return camera
-    lens, counts = _LENSES.get(told.model, (opencv_lens, ()))
+    lens, counts = _LENSES.get(told.model, (OpenCVModel, ()))
     if len(told.coefficients) not in counts:
         raise InputError(
             f"{where}: has the distortion model {told.model!r} with {len(told.coefficients)} coefficients, which is "
@@ -145,15 +146,11 @@ def straightener(told: BagCamera, size: tuple[int, int]) -> tuple[NDArray[np.flo
         shapes = " and ".join("{}x{}".format(*each) for each in (size, told.size))
         raise InputError(f"{name}: pictures and camera have other shapes ({shapes}). Give these with --intrinsics.")
     used, maps = cameras.as_used([name], [size], {size: size})[1][name], fit[1]
-    matrix = np.array([[used.focal_px[0], 0, used.centre_px[0]], [0, used.focal_px[1], used.centre_px[1]], [0, 0, 1]])
 
     def straighten(image: Image) -> Image:
-        if maps is None:
-            return image
-        straight: Any = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return straight
+        return image if maps is None else undistorted(image, maps)
 
-    return matrix, straighten
+    return used.intrinsics, straighten
 
 
 def _files(source: Path) -> list[Path]:

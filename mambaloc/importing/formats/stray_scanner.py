@@ -2,7 +2,8 @@
 
 ``odometry.csv`` has a header and a row a frame, ``timestamp, frame, x, y, z, qx, qy, qz, qw`` in seconds and metres,
 and in newer versions ``fx, fy, cx, cy``. ``camera_matrix.csv`` is K, 3x3, of the film's frames. ``rgb.mp4`` is the
-film, and ``depth/NNNNNN.png`` a frame's depth in millimetres of 16 bits, with the same field of view. Source:
+film, ``depth/NNNNNN.png`` a frame's depth in millimetres of 16 bits, with the same field of view, and
+``confidence/NNNNNN.png`` how sure ARKit is of each of its pixels: 0, 1 or 2. Source:
 ``docs/format.md`` of github.com/strayrobots/scanner. The app turns ARKit's camera axes to OpenCV's before it writes a
 quaternion, which the format does not say: ``OdometryEncoder.swift`` there, and its author's answer in issue 11. The
 principal point is ARKit's, counted from the corner of the top-left pixel.
@@ -27,6 +28,7 @@ from mambaloc.importing.formats.parsing import Table, as_numbers, folder_name, r
 
 _FILM, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+_SENSOR = ("depth", "confidence")
 _LENS = ("fx", "fy", "cx", "cy")
 _CHOICES = {
     "axes": "OpenCV camera axes, which the app writes; the world is ARKit's",
@@ -62,7 +64,7 @@ def read_stray_scanner(source: Path) -> Capture:
     size = stored_size(images[0])
     matrix = _camera_matrix(source / _MATRIX)
     names, cameras = told_apart([_camera(table, row, size, matrix, source) for row in present])
-    depth = [source / "depth" / f"{numbers[row]:06d}.png" for row in present]
+    depth, confidence = (_files_of(source / kind, [numbers[row] for row in present]) for kind in _SENSOR)
     posed = [
         Posed(
             image,
@@ -70,10 +72,11 @@ def read_stray_scanner(source: Path) -> Capture:
             checked.poses[row],
             name,
             table.numbers[row, 0],
-            depth=file if file.is_file() else None,
+            depth=measured,
+            confidence=sure,
             fault=checked.faults.get(row, ""),
         )
-        for image, row, name, file in zip(images, present, names, depth, strict=True)
+        for image, row, name, measured, sure in zip(images, present, names, depth, confidence, strict=True)
     ]
     return build_capture(
         "stray_scanner",
@@ -83,6 +86,7 @@ def read_stray_scanner(source: Path) -> Capture:
         choices={
             **_CHOICES,
             **checked.choices,
+            **_depth_choice(depth, confidence),
             "frames": f"{len(film.images)} of {film.read}, by sharpness and movement",
         },
         cameras=cameras,
@@ -90,6 +94,22 @@ def read_stray_scanner(source: Path) -> Capture:
         beside=film.images.values(),
         depth_camera=_depth_camera([each.depth for each in posed if each.depth is not None], size, matrix),
     )
+
+
+def _files_of(folder: Path, numbers: Sequence[int]) -> list[Path | None]:
+    """The PNG of each frame; None where there is none."""
+    files = [folder / f"{number:06d}.png" for number in numbers]
+    return [file if file.is_file() else None for file in files]
+
+
+def _depth_choice(depth: Sequence[Path | None], confidence: Sequence[Path | None]) -> dict[str, str]:
+    """What was decided of depth, by name; nothing where there is none."""
+    count = sum(file is not None for file in depth)
+    sure = sum(None not in pair for pair in zip(depth, confidence, strict=True))
+    if not count:
+        return {}
+    said = f"pixels of confidence 0, of 0 to 2, are left out in {sure} of {count} frames" if sure else "all pixels"
+    return {"depth": said}
 
 
 def _odometry(path: Path) -> Table:

@@ -18,12 +18,9 @@ from numpy.typing import NDArray
 
 from mambaloc.images import CORNER_PX, center_corner
 from mambaloc.importing.capture import Camera
-from mambaloc.importing.undistort.distortion import pinhole_of, sampled_at
-
-Size = tuple[int, int]
-"""Width and height, in pixels."""
-
-Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
+from mambaloc.importing.undistort.pinhole import pinhole_of
+from mambaloc.runtime.camera_models import CameraModel, Size, is_same_shape, scaled_intrinsics
+from mambaloc.runtime.undistortion import Maps, sampled_at
 
 _NEAR = 0.05
 _MAPS_KEPT = 4  # of cameras, at a time: each is as large as a few images
@@ -40,7 +37,7 @@ class FittedCameras:
 
     def size(self, name: str) -> Size:
         """Of the pictures that a camera is told for."""
-        return self.told[name].width, self.told[name].height
+        return self.told[name].size
 
     def fitted(self, name: str, size: Size) -> tuple[Camera, Maps | None] | None:
         """The lens in pixels of a picture of that size, and maps that undistort it; None where the shapes differ."""
@@ -78,38 +75,28 @@ class FittedCameras:
 
     def _maps(self, name: str, size: Size) -> Maps | None:
         found = self.found[name, size]
-        return None if found is None or found[0].distorted is None else sampled_at(*found)
-
-
-def is_same_shape(size: Sequence[float], other: Sequence[float]) -> bool:
-    """Whether one scale leads from a size to another, each of whose sides may be rounded by less than a pixel."""
-    apart = abs(other[0] / size[0] - other[1] / size[1])
-    return apart < 1 / size[0] + 1 / size[1]
+        return None if found is None or found[0].distorted is None else sampled_at(found[0].distorted, found[1])
 
 
 def fitted(camera: Camera, size: Size) -> Camera | None:
     """A camera in pixels of its picture of a size (width, height); None where that is of another shape."""
-    own = camera.width, camera.height
-    if size == own:
+    if size == camera.size:
         return camera
-    return scaled(camera, size) if is_same_shape(own, size) else None
+    return scaled(camera, size) if is_same_shape(camera.size, size) else None
 
 
 def scaled(camera: Camera, size: Size) -> Camera:
     """A camera in pixels of its pictures resized to (width, height), each side by itself, as COLMAP does."""
-    scale = np.array(size) / (camera.width, camera.height)
+    x, y = size[0] / camera.width, size[1] / camera.height
     lens = camera.distorted
 
     def distorted(rays: NDArray[np.float64]) -> NDArray[np.float64]:
         assert lens is not None
-        return (lens(rays) + CORNER_PX) * scale - CORNER_PX
+        return (lens(rays) + CORNER_PX) * (x, y) - CORNER_PX
 
-    fx, fy = (np.array(camera.focal_px) * scale).tolist()
-    cx, cy = ((np.array(camera.centre_px) + CORNER_PX) * scale - CORNER_PX).tolist()
-    width, height = size
-    return replace(
-        camera, width=width, height=height, focal_px=(fx, fy), centre_px=(cx, cy), distorted=lens and distorted
-    )
+    there = lens.scaled((x, y)) if isinstance(lens, CameraModel) else lens and distorted
+    focal_px, centre_px = scaled_intrinsics(camera.focal_px, camera.centre_px, (x, y))
+    return Camera(*size, focal_px, centre_px, there, camera.model)
 
 
 def cropped(pinhole: Camera, size: Size) -> Camera:

@@ -19,7 +19,9 @@ from mambaloc.exif import orientation_of, without_exif
 from mambaloc.images import Image, center_cropped
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.undistort.decoding import Decoding, decoding_of
-from mambaloc.importing.undistort.fitting import FittedCameras, Size, common_sizes
+from mambaloc.importing.undistort.fitting import FittedCameras, common_sizes
+from mambaloc.runtime.camera_models import Size
+from mambaloc.runtime.undistortion import undistorted
 
 IMAGES = "images"
 _JPEG_QUALITY = 95
@@ -100,6 +102,9 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
         return None if values is None else tuple(values[row] for row in rows)
 
     depth = capture.depth
+    if depth is not None:
+        confidence = tuple(depth.confidence[row] for row in rows) if depth.confidence else ()
+        depth = replace(depth, files=tuple(depth.files[row] for row in rows), confidence=confidence)
     return replace(
         capture,
         images=tuple(capture.images[row] for row in rows),
@@ -108,7 +113,7 @@ def selected(capture: Capture, rows: Sequence[int]) -> Capture:
         camera_of=of(capture.camera_of),
         time_s=None if capture.time_s is None else capture.time_s[np.array(rows, dtype=np.int64)],
         split=of(capture.split),
-        depth=depth and replace(depth, files=tuple(depth.files[row] for row in rows)),
+        depth=depth,
         tracks=capture.tracks and capture.tracks.of_frames(np.array(rows, dtype=np.int64)),
     )
 
@@ -139,8 +144,7 @@ def _write(
         target.write_bytes(copy)
         return _size(image), is_upright
     if maps is not None:
-        # The border's last hundredth of a pixel is rounding, and nothing to be black.
-        image = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
+        image = undistorted(image, maps)
     if crop is not None:
         image = center_cropped(image, crop[::-1])
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if target.suffix != ".png" else []

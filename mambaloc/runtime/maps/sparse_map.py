@@ -21,6 +21,7 @@ from mambaloc.runtime.maps.acceptance import RULE
 from mambaloc.runtime.maps.drift import NUGGET
 from mambaloc.runtime.maps.features import check_intrinsics
 from mambaloc.runtime.maps.lens import Lens
+from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
 
 VERSION = 2
@@ -60,6 +61,7 @@ class SparseMap:
             last they are.
         first_drift: ``drift`` before any key frame was added; (0, 6) where it has not changed since.
         world: where the scene's frame lies in that of the data it was made of.
+        undistortion: how its pictures were made of what their camera stored.
     """
 
     points_m: NDArray[np.float32]
@@ -77,6 +79,7 @@ class SparseMap:
     sessions: dict[str, int] = field(default_factory=dict)
     first_drift: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     world: World = field(default_factory=World)
+    undistortion: Undistortion = field(default_factory=Undistortion)
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -122,6 +125,7 @@ class SparseMap:
             "digests": self.digests,
             "sessions": self.sessions,
             "world": asdict(self.world),
+            "undistortion": self.undistortion.to_json(),
             "crc32": _crc32(arrays),
         }
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -187,7 +191,7 @@ class SparseMap:
             int(about["least_inliers"]), str(about["scene"]),
             {str(name): str(digest) for name, digest in dict(about["digests"]).items()},
             Lens(*map(float, arrays["lens"])), arrays["drift"], nugget, sessions, arrays["first_drift"],
-            World.from_json(about.get("world")),
+            World.from_json(about.get("world")), Undistortion.from_json(about.get("undistortion")),
         )  # fmt: skip
 
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.formats.finding import find_pictures
-from mambaloc.importing.undistort.distortion import opencv_lens
 from mambaloc.importing.undistort.fitting import common_sizes, fitted
 from mambaloc.importing.undistort.pictures import write_pictures
+from mambaloc.runtime.camera_models import OpenCVModel
 
 SPREAD = 90.0  # grey levels a unit of ray
 
@@ -60,7 +60,7 @@ def test_written_pictures_show_what_their_cameras_say(devices):
             images.append(folder / f"{number}.png")
             cv2.imwrite(str(images[-1]), seen(*size, [f * scale for f in focal], middle, k1))
             centre_px = (centre[0] - 0.5, centre[1] - 0.5)
-            lens = opencv_lens(focal, centre_px, (k1, 0, 0, 0, 0)) if k1 else None
+            lens = OpenCVModel(focal, centre_px, (k1, 0, 0, 0, 0)) if k1 else None
             cameras[f"camera-{number}"] = Camera(width, height, focal, centre_px, lens)
         capture = capture_of(
             poses_at(line(len(images))), images=tuple(images), cameras=cameras, camera_of=tuple(cameras)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from unittest import mock
 
@@ -11,8 +12,11 @@ import pytest
 from colmap_models import MODELS, NAMES, pycolmap, write_model
 from recorded import FRAMES, SIZE
 
+from mambaloc.data.cameras import undistortion_of
 from mambaloc.importing.formats.colmap import read_colmap
+from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import read_capture
+from mambaloc.runtime.camera_models import CameraModel
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -100,6 +104,16 @@ def test_pixels_are_those_of_an_independent_projection(recording, tmp_path, mode
         pixels = camera.distorted(rays)
         assert np.abs(pixels - rays * camera.focal_px - camera.centre_px).max() > 0.1  # it does distort
     np.testing.assert_allclose(pixels, oracle(model, rays), atol=1e-6)
+    assert isinstance(camera.distorted, CameraModel) == (model not in ("PINHOLE", "SIMPLE_PINHOLE", "FOV"))
+
+
+def test_a_lens_that_is_none_of_opencvs_is_not_kept_and_the_scene_says_why(recording, tmp_path):
+    write_model(recording, tmp_path / "capture", models=("FOV",))
+    recording.write(tmp_path / "capture", NAMES)
+    import_scene(tmp_path / "capture", tmp_path / "scene")
+    lens = json.loads((tmp_path / "scene/scene.json").read_text())["cameras"]["camera-1"]["lens"]
+    assert (lens["model"], lens["opencv"]) == ("FOV", None)
+    assert undistortion_of(tmp_path / "scene").unknown == "its model, FOV, is not one of OpenCV's"
 
 
 def test_a_thin_prism_is_pycolmaps(recording, tmp_path):

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mambaloc.errors import InputError
+from mambaloc.importing.checks.depth import sampled
 from mambaloc.importing.checks.explanations import AS_READ, by_convention
 from mambaloc.importing.checks.matching import find_matches
 from mambaloc.importing.formats.stray_scanner import read_stray_scanner
 from mambaloc.importing.motion import motion_of
 from mambaloc.importing.registry import read_capture
+from mambaloc.importing.undistort.pictures import selected
 from mambaloc.rendering import default_intrinsics, furnished_room, render, smooth_trajectory
 
 SIZE, FRAMES = (320, 240), 40
@@ -92,6 +95,42 @@ def test_depth_is_that_of_the_frame_and_its_camera_sees_the_same(source, walk):
     assert [file.stem for file in capture.depth.files] == [image.stem for image in capture.images]
     ray = np.linalg.inv(capture.depth.intrinsics) @ (10, 20, 1)
     np.testing.assert_allclose(default_intrinsics(SIZE) @ ray, (41.5, 81.5, 1), atol=1e-9)
+
+
+def test_depth_of_low_confidence_is_left_out(source):
+    """Guess: 0 is the lowest of three, as in ARKit; the format's page says the same."""
+    assert read_capture(source).choices["depth"] == "all pixels"
+    (source / "confidence").mkdir()
+    sure = np.full((60, 80), 2, np.uint8)
+    sure[:, :20], sure[:, 20:40] = 0, 1
+    numbers = [int(image.stem) for image in read_capture(source).images]
+    for number in numbers[1:]:  # the first has none: all of its depth counts
+        cv2.imwrite(str(source / f"confidence/{number:06d}.png"), sure)
+    capture, count = read_capture(source), len(numbers)
+    said = f"pixels of confidence 0, of 0 to 2, are left out in {count - 1} of {count} frames"
+    assert capture.choices["depth"] == said
+    pixels = np.array([[10, 30], [19, 30], [20, 30], [60, 30]])
+    rays = np.column_stack((pixels, np.ones(4))) @ np.linalg.inv(capture.depth.intrinsics)[:2].T
+    for row in (0, 3):
+        measured = cv2.imread(str(source / f"depth/{numbers[row]:06d}.png"), cv2.IMREAD_UNCHANGED)
+        expected = measured[pixels[:, 1], pixels[:, 0]] / 1000
+        expected[:2] = np.nan if row else expected[:2]
+        np.testing.assert_allclose(sampled(capture.depth, row, rays), expected)
+    np.testing.assert_array_equal(sampled(selected(capture, [3, 0]).depth, 0, rays), sampled(capture.depth, 3, rays))
+
+
+@pytest.mark.parametrize("damage", ["cut", "size", "depth"])
+def test_a_damaged_confidence_map_is_named(source, damage):
+    number = int(read_capture(source).images[0].stem)
+    (source / "confidence").mkdir()
+    file = source / f"confidence/{number:06d}.png"
+    shape, kind = ((50, 80) if damage == "size" else (60, 80)), np.uint16 if damage == "depth" else np.uint8
+    cv2.imwrite(str(file), np.ones(shape, kind))
+    if damage == "cut":
+        file.write_bytes(file.read_bytes()[:-9])
+    with pytest.raises(InputError, match=rf"confidence/{number:06d}\.png: is no whole 8-bit PNG") as caught:
+        sampled(read_capture(source).depth, 0, np.zeros((1, 2)))
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
-from mambaloc.importing.capture import Camera
-from mambaloc.importing.undistort.distortion import sampled_at
+from mambaloc.runtime.camera_models import Pinhole
+from mambaloc.runtime.undistortion import sampled_at, undistorted
 
 
 def test_samples_are_not_rounded_to_a_thirty_second_of_a_pixel():
@@ -18,9 +17,10 @@ def test_samples_are_not_rounded_to_a_thirty_second_of_a_pixel():
     shifts_px = np.linspace(0, 1, 101)[:-1]
 
     def sample(shift_px: float) -> float:
-        lens = Camera(128, 40, (100.0, 100.0), (63.5, 19.5), lambda rays: 100.0 * rays + (63.5 + shift_px, 19.5), "any")
-        pinhole = Camera(128, 40, (100.0, 100.0), (63.5, 19.5))
-        seen = cv2.remap(stripes, *sampled_at(lens, pinhole), interpolation=cv2.INTER_LINEAR)
+        maps = sampled_at(
+            lambda rays: 100.0 * rays + (63.5 + shift_px, 19.5), Pinhole(128, 40, (100.0, 100.0), (63.5, 19.5))
+        )
+        seen = undistorted(stripes, maps)
         return float(seen[20, 64])  # a column of 0, beside one of 255
 
     np.testing.assert_allclose([sample(shift) for shift in shifts_px], 255 * shifts_px, atol=0.6)

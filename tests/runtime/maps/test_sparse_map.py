@@ -73,6 +73,7 @@ CHANGES = {
     "a list for a record": {"about": "[]"},
     "digests that are a number": {"about": {"digests": 3}},
     "inliers that are a word": {"about": {"least_inliers": "many"}},
+    "a lens that is a number": {"about": {"undistortion": 7}},
     "points in float64": {"points_m": np.zeros((9, 3))},
     "a point too few": {"points_m": np.zeros((8, 3), np.float32)},
     "NaN": {"points_m": np.full((9, 3), np.nan, np.float32)},

@@ -7,7 +7,9 @@ import pytest
 from mambaloc.errors import InputError
 from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera
-from mambaloc.importing.undistort.distortion import opencv_fisheye, opencv_lens, pinhole_of, sampled_at
+from mambaloc.importing.undistort.pinhole import pinhole_of
+from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
+from mambaloc.runtime.undistortion import sampled_at
 
 WIDTH, HEIGHT = 320, 240
 LENSES = {
@@ -19,7 +21,7 @@ LENSES = {
 }
 
 
-def camera(coefficients, focal_px=(250.0, 240.0), centre_px=(150.0, 125.0), lens=opencv_lens):
+def camera(coefficients, focal_px=(250.0, 240.0), centre_px=(150.0, 125.0), lens=OpenCVModel):
     return Camera(WIDTH, HEIGHT, focal_px, centre_px, lens(focal_px, centre_px, coefficients))
 
 
@@ -45,7 +47,7 @@ def test_a_fisheye_by_hand():
     x, y = 0.8, 0.6
     theta = np.arctan(np.hypot(x, y))
     reach = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8) / np.hypot(x, y)
-    (found,) = camera(told, lens=opencv_fisheye).distorted(np.array([[x, y]]))
+    (found,) = camera(told, lens=FisheyeModel).distorted(np.array([[x, y]]))
     np.testing.assert_allclose(found, (250 * reach * x + 150, 240 * reach * y + 125), atol=1e-6)
 
 
@@ -56,14 +58,14 @@ def test_a_pinhole_shows_all_it_can_and_no_border(name):
     assert (pinhole.width, pinhole.height, pinhole.centre_px) == (WIDTH, HEIGHT, lens.centre_px)
     assert pinhole.distorted is None
     assert pinhole.focal_px[0] / pinhole.focal_px[1] == pytest.approx(250 / 240)
-    columns, rows = sampled_at(lens, pinhole)
+    columns, rows = sampled_at(lens.distorted, pinhole)
     assert columns.min() > -0.02
     assert rows.min() > -0.02
     assert columns.max() < WIDTH - 1 + 0.02
     assert rows.max() < HEIGHT - 1 + 0.02
     # A little wider, and it would look past the border; or, where the lens folds back, see a place in the mirror.
     wider = Camera(WIDTH, HEIGHT, tuple(0.97 * f for f in pinhole.focal_px), pinhole.centre_px)
-    columns, rows = sampled_at(lens, wider)
+    columns, rows = sampled_at(lens.distorted, wider)
     is_out = min(columns.min(), rows.min(), WIDTH - 1 - columns.max(), HEIGHT - 1 - rows.max()) < 0
     by_row, by_column = (np.gradient(seen.astype(float)) for seen in (columns, rows))
     assert is_out or (by_row[1] * by_column[0] <= by_row[0] * by_column[1]).any()
@@ -76,17 +78,17 @@ def test_pixels_come_from_where_opencv_takes_them(name):
     expected = cv2.initUndistortRectifyMap(
         matrix_of(lens), np.array(LENSES[name]), None, matrix_of(pinhole), (WIDTH, HEIGHT), cv2.CV_32FC1
     )
-    np.testing.assert_allclose(sampled_at(lens, pinhole), expected, atol=1e-3)
+    np.testing.assert_allclose(sampled_at(lens.distorted, pinhole), expected, atol=1e-3)
 
 
 def test_pixels_of_a_fisheye_come_from_where_opencv_takes_them():
     coefficients = (0.05, -0.02, 0.01, -0.005)
-    lens = camera(coefficients, (110.0, 110.0), lens=opencv_fisheye)
+    lens = camera(coefficients, (110.0, 110.0), lens=FisheyeModel)
     pinhole = pinhole_of("a", lens)
     expected = cv2.fisheye.initUndistortRectifyMap(
         matrix_of(lens), np.array(coefficients), None, matrix_of(pinhole), (WIDTH, HEIGHT), cv2.CV_32FC1
     )
-    np.testing.assert_allclose(sampled_at(lens, pinhole), expected, atol=1e-3)
+    np.testing.assert_allclose(sampled_at(lens.distorted, pinhole), expected, atol=1e-3)
 
 
 def test_the_longest_image_can_be_undistorted():

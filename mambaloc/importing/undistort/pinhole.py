@@ -1,54 +1,19 @@
-"""Lens distortion: OpenCV's models, and how an image is made that of a pinhole, without black borders."""
+"""The pinhole whose image a distorted one can fill, without black borders."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Camera
 
-Pixels = NDArray[np.float64]
-
 _NARROWEST = 8.0  # as a factor of the focal length, at which any lens that is one fills the image
 _WIDEST = 0.05
 _SEARCH = 0.98
 _BORDER_POINTS = 200  # a side
-
-
-def opencv_lens(
-    focal_px: tuple[float, float], centre_px: tuple[float, float], coefficients: Sequence[float]
-) -> Callable[[Pixels], Pixels]:
-    """Brown's model as OpenCV has it: pixels (N, 2) of rays (N, 2).
-
-    Args:
-        focal_px: along x and y.
-        centre_px: principal point.
-        coefficients: k1, k2, p1, p2, and k3 if there is one.
-    """
-    matrix, told = _matrix(focal_px, centre_px), np.array(coefficients, dtype=np.float64)
-
-    def distorted(rays: Pixels) -> Pixels:
-        points = np.concatenate((rays, np.ones((len(rays), 1))), axis=1)[:, None]
-        return cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, told)[0][:, 0].astype(np.float64)
-
-    return distorted
-
-
-def opencv_fisheye(
-    focal_px: tuple[float, float], centre_px: tuple[float, float], coefficients: Sequence[float]
-) -> Callable[[Pixels], Pixels]:
-    """OpenCV's fisheye, an equidistant lens; the arguments of :func:`opencv_lens`, with k1 to k4."""
-    matrix, told = _matrix(focal_px, centre_px), np.array(coefficients, dtype=np.float64)
-
-    def distorted(rays: Pixels) -> Pixels:
-        return cv2.fisheye.distortPoints(np.ascontiguousarray(rays)[:, None], matrix, told)[:, 0].astype(np.float64)
-
-    return distorted
 
 
 def pinhole_of(name: str, camera: Camera) -> Camera:
@@ -82,16 +47,6 @@ def pinhole_of(name: str, camera: Camera) -> Camera:
     return replace(camera, focal_px=focal_px, distorted=None, model="pinhole")
 
 
-def sampled_at(camera: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where each pixel of the pinhole's image lies in the camera's: columns and rows (H, W), for ``cv2.remap``."""
-    columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
-    pixels = np.stack((columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
-    rays = (pixels - pinhole.centre_px) / pinhole.focal_px
-    assert camera.distorted is not None
-    seen = camera.distorted(rays).astype(np.float32).reshape(pinhole.height, pinhole.width, 2)
-    return np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
-
-
 def _reach(camera: Camera, zoom: float) -> NDArray[np.float64] | None:
     """How far from the centre a pinhole's border is seen, in pixels; None where a part of it is outside the image."""
     last = np.array((camera.width - 1, camera.height - 1), dtype=np.float64)
@@ -104,7 +59,3 @@ def _reach(camera: Camera, zoom: float) -> NDArray[np.float64] | None:
     if not np.isfinite(seen).all() or (seen < 0).any() or (seen > last).any():
         return None
     return np.linalg.norm(seen - camera.centre_px, axis=-1)
-
-
-def _matrix(focal_px: tuple[float, float], centre_px: tuple[float, float]) -> NDArray[np.float64]:
-    return np.array([[focal_px[0], 0, centre_px[0]], [0, focal_px[1], centre_px[1]], [0, 0, 1]])
