@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +48,24 @@ class ErrorsByDistance:
     distance: Tensor
     position_error_m: Tensor
     rotation_error_deg: Tensor
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What a model states of its poses of some frames.
+
+    Shape:
+        (N,) each: radii in metres and degrees, and the unfamiliarity.
+    """
+
+    position_radius_m: Tensor
+    rotation_radius_deg: Tensor
+    unfamiliarity: Tensor
+
+    def by_frame(self) -> Iterator[tuple[float, float, float]]:
+        """The three numbers of each frame."""
+        each = (self.position_radius_m, self.rotation_radius_deg, self.unfamiliarity)
+        return zip(*(numbers.tolist() for numbers in each), strict=True)
 
 
 class UncertaintyHead(nn.Module):
@@ -132,6 +150,23 @@ def fit_uncertainty(system: LitPoseRegressor, data: PoseDataModule) -> Uncertain
     head, held_out = head_and_held_out(system, data)
     head.calibrate(held_out, LEVEL)
     return head
+
+
+def uncertainty_of_test(system: LitPoseRegressor, data: PoseDataModule) -> Uncertainty | None:
+    """What the exported model states of the test frames; None where it states nothing.
+
+    Args:
+        system: trained; left as it was.
+        data: what it was trained with.
+    """
+    try:
+        head = fit_uncertainty(system, data)
+    except InputError:
+        return None
+    data.setup("test")
+    network = copy.deepcopy(system.network).cpu().float().eval()
+    with torch.inference_mode():
+        return Uncertainty(*head(seen_of(network, (batch.image for batch in data.batches("test")))))
 
 
 def head_and_held_out(system: LitPoseRegressor, data: PoseDataModule) -> tuple[UncertaintyHead, ErrorsByDistance]:

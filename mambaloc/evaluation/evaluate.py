@@ -25,6 +25,7 @@ from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.models.weights import mib, parameter_count
 from mambaloc.nn import PooledBackbone
 from mambaloc.runtime.trajectory import write_tum
+from mambaloc.uncertainty import uncertainty_of_test
 from mambaloc.viz.trajectory import draw_trajectory
 
 
@@ -62,7 +63,7 @@ def evaluate_checkpoint(
     started = time.perf_counter()
     table = localise_test_frames(system, data, accelerator)
     seconds = time.perf_counter() - started
-    both = beside.beside(table) if beside else None
+    both = beside.beside(table, lambda: uncertainty_of_test(system, data)) if beside else None
     result = {
         "metrics": summarise(table),
         "count": len(table.index),

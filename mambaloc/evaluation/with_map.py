@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -22,6 +22,7 @@ from mambaloc.metrics import PoseErrorTable
 from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
 from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
+from mambaloc.uncertainty import Uncertainty
 
 RUN_MAP = Path("map", MAP_FILE)
 """Where a run keeps its map."""
@@ -81,16 +82,23 @@ class MeasuredMap:
     intrinsics: Floats
     alone: Answers
 
-    def beside(self, network: PoseErrorTable) -> Answers:
+    def beside(self, network: PoseErrorTable, uncertainty: Callable[[], Uncertainty | None]) -> Answers:
         """Localise each frame around a network's pose, which is the answer where the map's is not likelier to be right.
 
         Args:
             network: its answers about the same frames.
+            uncertainty: of these, as an exported model states it; None where it states none. Only asked for where the
+                map does not accept every pose.
         """
         poses = (network.predicted_position_m.cpu().numpy(), network.predicted_quaternion.cpu().numpy())
         said = [Localisation(position_m, quaternion, 0.0) for position_m, quaternion in zip(*poses, strict=True)]
         priors = [CameraPose.from_quaternion(each.quaternion, each.position_m) for each in said]
         found, cpu_s = localise_frames(self.localiser, self.frames.image_paths, self.intrinsics, priors)
+        if not all(each.is_accepted for each in found) and (stated := uncertainty()) is not None:
+            said = [
+                replace(each, position_radius_m=radius_m, rotation_radius_deg=radius_deg, unfamiliarity=unfamiliarity)
+                for each, (radius_m, radius_deg, unfamiliarity) in zip(said, stated.by_frame(), strict=True)
+            ]
         answers = [combined(*both) for both in zip(said, found, strict=True)]
         return Answers.of(answers, self.frames, cpu_s)
 

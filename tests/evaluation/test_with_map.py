@@ -11,12 +11,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from mambaloc.errors import InputWarning
 from mambaloc.evaluation import evaluate_checkpoint, measure_map, measure_map_of_run, print_table
 from mambaloc.models import Checkpoint
 from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.uncertainty import Uncertainty
 
 TOOL = Path(__file__).parents[2] / "tools/evaluate.py"
 
@@ -124,6 +126,17 @@ def test_both_are_the_map_where_it_is_accepted_or_likelier_and_the_network_elsew
     tum = np.loadtxt(out / "predictions_both.tum")
     np.testing.assert_allclose(tum[:, 1:4], [pose_of(row)[0] for row in both], atol=1e-6)
     assert json.loads((out / "metrics.json").read_text())["network_and_map"] == result["network_and_map"]
+
+
+def test_a_network_that_states_its_radii_is_weighed_by_them(trained_with_map, unsure, tmp_path, monkeypatch):
+    """As a bundle weighs it: radii of a centimetre and a degree are surer than any pose that the map rejects."""
+    checkpoint = Checkpoint.read(trained_with_map / "checkpoints/last.ckpt")
+    stated = Uncertainty(*torch.tensor([[0.01], [1.0], [0.5]]).expand(3, len(frames_of(trained_with_map))))
+    monkeypatch.setattr("mambaloc.evaluation.evaluate.uncertainty_of_test", lambda system, data: stated)
+    measured = measure_map(unsure, checkpoint.data())
+    result = evaluate_checkpoint(checkpoint, tmp_path, accelerator="cpu", beside=measured)
+    sources = [row["source"] for row in rows_of(tmp_path / "predictions_both.csv")]
+    assert sources.count("map") / len(sources) == result["network_and_map"]["metrics"]["accepted"]
 
 
 def test_the_table_has_a_row_each(measured, capsys):
