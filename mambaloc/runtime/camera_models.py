@@ -76,6 +76,10 @@ class CameraModel(ABC):
     def __call__(self, rays: Floats) -> Floats:
         """Pixels (N, 2) of rays (N, 2), which are ``x / z`` and ``y / z``."""
 
+    @abstractmethod
+    def of_pixels(self, pinhole: Pinhole) -> NDArray[np.float32]:
+        """The same of the rays of all pixels of a pinhole's picture, (H, W, 2) float32, a hundred times as fast."""
+
     def scaled(self, scale: Sequence[float]) -> Self:
         """The same of pictures resized by factors of width and height."""
         focal, centre = scaled_intrinsics(self.focal_px, self.centre_px, scale)
@@ -95,6 +99,12 @@ class OpenCVModel(CameraModel):
         matrix, none = matrix_of(self.focal_px, self.centre_px), np.zeros(3)
         return cv2.projectPoints(points, none, none, matrix, np.array(self.coefficients))[0][:, 0].astype(np.float64)
 
+    def of_pixels(self, pinhole: Pinhole) -> NDArray[np.float32]:
+        """Pixels of a pinhole's pixels, (H, W, 2) float32."""
+        matrix, told = matrix_of(self.focal_px, self.centre_px), np.array(self.coefficients)
+        maps = cv2.initUndistortRectifyMap(matrix, told, None, pinhole.intrinsics, pinhole.size, cv2.CV_32FC1)
+        return np.dstack(maps)
+
 
 @dataclass(frozen=True)
 class FisheyeModel(CameraModel):
@@ -107,6 +117,14 @@ class FisheyeModel(CameraModel):
         """Pixels of rays, both (N, 2)."""
         points, matrix = np.ascontiguousarray(rays)[:, None], matrix_of(self.focal_px, self.centre_px)
         return cv2.fisheye.distortPoints(points, matrix, np.array(self.coefficients))[:, 0].astype(np.float64)
+
+    def of_pixels(self, pinhole: Pinhole) -> NDArray[np.float32]:
+        """Pixels of a pinhole's pixels, (H, W, 2) float32."""
+        matrix, told = matrix_of(self.focal_px, self.centre_px), np.array(self.coefficients)
+        maps = cv2.fisheye.initUndistortRectifyMap(
+            matrix, told, np.eye(3), pinhole.intrinsics, pinhole.size, cv2.CV_32FC1
+        )
+        return np.dstack(maps)
 
 
 MODELS: dict[str, type[CameraModel]] = {model.name: model for model in (OpenCVModel, FisheyeModel)}

@@ -128,13 +128,15 @@ def sampled_at(projected: Callable[[Floats], Floats], pinhole: Pinhole) -> Maps:
         projected: stored pixels (N, 2) of rays (N, 2), such as a :class:`~mambaloc.runtime.camera_models.CameraModel`.
         pinhole: of the picture that is wanted.
     """
-    columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
-    pixels = np.stack((columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
-    seen = projected((pixels - pinhole.centre_px) / pinhole.focal_px)
+    if isinstance(projected, CameraModel):
+        seen: NDArray[np.floating[Any]] = projected.of_pixels(pinhole)
+    else:
+        columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
+        pixels = np.stack((columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+        seen = projected((pixels - pinhole.centre_px) / pinhole.focal_px).reshape(pinhole.height, pinhole.width, 2)
     # What no lens sees is outside.
     seen = np.clip(np.nan_to_num(seen, nan=-1.0), -LARGEST_SIDE_PX, 2 * LARGEST_SIDE_PX).astype(np.float32)
-    whole = seen.reshape(pinhole.height, pinhole.width, 2)
-    return np.ascontiguousarray(whole[..., 0]), np.ascontiguousarray(whole[..., 1])
+    return np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
 
 
 @lru_cache(_MAPS_KEPT)
