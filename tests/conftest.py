@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import yaml
 from filelock import FileLock
 from hypothesis import settings
+from tiny import TINY_BACKBONE, TINY_MAMBALOC, write_recipe
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # each worker a core of its own; read when torch is imported
@@ -20,14 +20,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 settings.register_profile("ci", max_examples=100, deadline=None)
 settings.register_profile("nightly", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
-
-TINY_BACKBONE = "test_efficientnet"
-"""timm's own network for tests: 82,000 parameters, feature maps at strides 2 to 32."""
-
-TINY_MAMBALOC = {
-    "backbone": TINY_BACKBONE, "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16, "head_hidden": 16,
-    "lr": 0.001, "lr_step_epochs": 2, "normalise_position": True,
-}  # fmt: skip
 
 
 @pytest.fixture(scope="session")
@@ -99,18 +91,6 @@ def map_of_den(made_once, den):
         build_map(train, MapSettings(width=160), "den").save(folder / MAP_FILE)
 
     return made_once("map_of_den", build) / "map.safetensors"
-
-
-def write_recipe(path: Path, scenes: Path, model: dict, data: dict, **trainer) -> Path:
-    """Write a recipe that trains a system on ``scenes``."""
-    recipe = {
-        "model": model,
-        "data": {"root": str(scenes), "scene": "heads", "image_size": 32, "short_side": 36, "batch_size": 4, **data},
-        "trainer": {"accelerator": "cpu", **trainer},
-        "onnx_export": {"enabled": False},
-    }
-    path.write_text(yaml.safe_dump(recipe))
-    return path
 
 
 @pytest.fixture

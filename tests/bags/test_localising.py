@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_writing import FIRST_NS, messages, recorder
-from conftest import TINY_MAMBALOC, write_recipe
 from scipy.spatial.transform import Rotation, Slerp
+from tiny import TINY_MAMBALOC, write_recipe
 
 from mambaloc.bags.reading import is_bag
 from mambaloc.bags.writing import TOPIC
