@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from fnmatch import fnmatch
-from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
 from mambaloc.errors import InputError, suggestion
 from mambaloc.models.base import LitPoseRegressor
-
-ENTRY_POINTS = "mambaloc.models"
-"""Group of the entry points by which installed packages name systems of theirs."""
+from mambaloc.plugins import MODELS, load_plugin, plugin_names
 
 _MODELS: dict[str, type[LitPoseRegressor]] = {}
 _System = TypeVar("_System", bound=type[LitPoseRegressor])
@@ -39,7 +36,7 @@ def register_model(name: str) -> Callable[[_System], _System]:
 
 def list_models(pattern: str = "*") -> list[str]:
     """Names of the systems that match a wildcard, those of other installed packages among them, sorted."""
-    return sorted(name for name in {*_MODELS, *entry_points(group=ENTRY_POINTS).names} if fnmatch(name, pattern))
+    return sorted(name for name in {*_MODELS, *plugin_names(MODELS)} if fnmatch(name, pattern))
 
 
 def model_class(name: str) -> type[LitPoseRegressor]:
@@ -49,7 +46,7 @@ def model_class(name: str) -> type[LitPoseRegressor]:
         InputError: for an unknown name, with near misses, and for an entry point that cannot be loaded.
     """
     if name not in _MODELS:
-        _load_from_packages(name)
+        load_plugin(MODELS, name)  # whose register_model does the rest
     if name not in _MODELS:
         if "." in name:
             raise InputError(
@@ -66,14 +63,3 @@ def create_model(name: str, **kwargs: Any) -> LitPoseRegressor:
         InputError: for an unknown name.
     """
     return model_class(name)(**kwargs)
-
-
-def _load_from_packages(name: str) -> None:
-    for point in entry_points(group=ENTRY_POINTS, name=name):
-        try:
-            point.load()  # whose register_model does the rest
-        except (ImportError, AttributeError) as error:
-            package = point.dist.name if point.dist else point.value
-            raise InputError(
-                f"model {name!r}: package {package} cannot be loaded ({error}). Install it anew."
-            ) from None

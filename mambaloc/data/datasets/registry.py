@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mambaloc import plugins
 from mambaloc.data.datasets import cambridge, capture, seven_scenes
 from mambaloc.data.datasets.capture import CAPTURE
 from mambaloc.data.datasets.dataset import Dataset, Source
 from mambaloc.errors import InputError, suggestion
+from mambaloc.plugins import load_plugin, plugin_names
 from mambaloc.user_cache import default_cache_dir
 
 EMBEDDED = "embedded"
@@ -51,7 +53,7 @@ def scene_folder(dataset: str, root: Path | None, scene: str) -> Path:
         InputError: for an unknown dataset or a scene that is not there, with how to get it.
     """
     if dataset not in DATASETS:
-        raise InputError(f"data.dataset {dataset!r}: there is none; choose one of {', '.join(DATASETS)}")
+        _add_from_packages(dataset)
     root = root or DATASETS[dataset].default_root
     if dataset == EMBEDDED:
         from mambaloc.rendering.scenes.embedded import ensure_embedded_scene
@@ -118,3 +120,13 @@ def describe_sources() -> str:
             size = f"{archive.size_bytes / 1e9:.1f} GB" if archive.size_bytes else "size told by the server"
             lines.append(f"  {scene:<14} {size}")
     return "\n".join(lines)
+
+
+def _add_from_packages(name: str) -> None:
+    found = load_plugin(plugins.DATASETS, name)
+    if found is None:
+        known = {*DATASETS, *plugin_names(plugins.DATASETS)}
+        raise InputError(f"data.dataset {name!r}: there is no such dataset. {suggestion(name, sorted(known))}")
+    if not isinstance(found, Dataset) or found.name != name:
+        raise InputError(f"data.dataset {name!r}: its package gives no Dataset of that name. Correct its entry point.")
+    DATASETS[name] = found
