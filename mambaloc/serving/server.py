@@ -227,6 +227,8 @@ def serve_bundles(
         listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except (OSError, OverflowError) as error:
         raise InputError(f"--host {host} --port {port}: cannot be listened at ({error}). Choose others.") from None
+    # asyncio does so for sockets of its own alone, and answers then wait 40 ms for what they acknowledge.
+    listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     app = create_app(workers, limits, token, host)
     config = uvicorn.Config(app, log_level="warning", lifespan="on", server_header=False, timeout_keep_alive=30)
     with listening:

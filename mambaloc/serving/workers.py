@@ -1,7 +1,7 @@
 """Processes that localise pictures. One that dies or hangs is replaced, and its picture is tried again.
 
-LitServe 0.2.19 and Ray Serve 2.56 were measured beside this (docs/serving.md): with the one, requests of a worker that
-is killed are never answered; with the other, an idle server takes 1.7 GiB.
+LitServe 0.2.19 and Ray Serve 2.60 were measured beside this (docs/serving.md): with the one, requests of a worker that
+is killed are not answered; with the other, an idle server takes 1.7 GiB.
 """
 
 from __future__ import annotations
