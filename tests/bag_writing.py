@@ -125,6 +125,18 @@ def recorder(path: Path, kind: str):
         yield Recorder(kind, bag)
 
 
+def recording_in(folder: Path):
+    """Records with a function of a :class:`Recorder`, in a kind of bag, and gives the path."""
+
+    def record(write, kind="mcap"):
+        path = folder / f"drive.{kind}" if kind == "bag" else folder / "drive"
+        with recorder(path, kind) as bag:
+            write(bag)
+        return path
+
+    return record
+
+
 def png(rgb: np.ndarray) -> bytes:
     return cv2.imencode(".png", rgb[..., ::-1])[1].tobytes()
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-import math
 import socket
 import time
+from argparse import ArgumentTypeError
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import uvicorn
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from starlette.applications import Starlette
@@ -25,6 +26,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
+from mambaloc.console import pinhole_matrix
 from mambaloc.errors import InputError
 from mambaloc.serving.workers import Answer, Task, WorkerLostError, Workers
 
@@ -257,9 +259,9 @@ def _intrinsics(text: str | None) -> _Matrix | None:
     if text is None:
         return None
     try:
-        fx, fy, cx, cy = map(float, text.split(","))
-    except ValueError:
+        matrix = pinhole_matrix(text)
+    except ArgumentTypeError:
         raise HTTPException(400, "intrinsics: give FX,FY,CX,CY in pixels of the picture.") from None
-    if not all(map(math.isfinite, (fx, fy, cx, cy))):
+    if not np.isfinite(matrix).all():
         raise HTTPException(400, "intrinsics: give finite numbers.")
-    return ((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
+    return tuple(map(tuple, matrix.tolist()))

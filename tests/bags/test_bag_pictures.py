@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from bag_writing import FIRST_NS, KINDS, png, recorder
+from bag_writing import FIRST_NS, KINDS, png, recording_in
 
 from mambaloc.bags.pictures import camera_of, camera_topic, picture_topic, pictures_of
 from mambaloc.bags.reading import is_bag, open_bag
@@ -28,13 +28,7 @@ def rgb():
 def record(tmp_path):
     """Record with a function of a :class:`bag_writing.Recorder`, in a kind of bag, and give the path."""
 
-    def record(write, kind="mcap"):
-        path = tmp_path / f"drive.{kind}" if kind == "bag" else tmp_path / "drive"
-        with recorder(path, kind) as bag:
-            write(bag)
-        return path
-
-    return record
+    return recording_in(tmp_path)
 
 
 def only(path):

@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc import provenance
+from mambaloc.benchmark.footprint import said_of
 from mambaloc.console import OptionParser, exits_cleanly, whole_number
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
@@ -171,10 +172,9 @@ def workers_of(server: int) -> list[int]:
 def resident_mib(process: int) -> float:
     """Resident memory of a process, in MiB; 0 of one that has ended."""
     try:
-        text = Path(f"/proc/{process}/status").read_text()
+        return said_of(Path(f"/proc/{process}/status"), "VmRSS:") / 1024
     except OSError:
         return 0.0
-    return next((int(line.split()[1]) / 1024 for line in text.splitlines() if line.startswith("VmRSS:")), 0.0)
 
 
 def in_words(load: Load) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,8 +30,7 @@ _OFFICIAL_INTRINSICS = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])
 _OFFICIAL_SIZE = (640, 480)
 NO_DEPTH_MM = (0, 65535)
 """What a depth frame has at pixels without a measurement."""
-PNG_END = b"IEND\xaeB`\x82"
-"""Last bytes of a whole PNG: OpenCV fills what a truncated file lacks with zeros and says nothing."""
+_PNG_END = b"IEND\xaeB`\x82"  # OpenCV fills what a truncated file lacks with zeros and says nothing
 
 
 def depth_path(image: Path) -> Path:
@@ -74,21 +74,25 @@ def read_depth_points(folder: Path, frames: Frames, cameras: Cameras, count: int
     return ScenePoints(stacked(points, count), "depth")
 
 
+def read_whole_png(path: Path) -> NDArray[Any] | None:
+    """The numbers of a PNG as they are stored; None where the file cannot be read, or is not whole."""
+    try:
+        data = path.read_bytes()
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data.endswith(_PNG_END) else None
+    except (OSError, cv2.error):
+        return None
+
+
 def read_depth_mm(path: Path) -> NDArray[np.uint16]:
     """Read a depth frame, (H, W).
 
     Raises:
         InputError: where it is not a complete 16-bit PNG of one channel.
     """
-    try:
-        data = path.read_bytes()
-        whole = data.endswith(PNG_END)
-        depth_mm = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
-    except (OSError, cv2.error):
-        depth_mm = None
+    depth_mm = read_whole_png(path)
     if depth_mm is None or depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
         raise InputError(f"{path}: is no whole 16-bit PNG of one channel; mend it, or remove it to do without it")
-    return depth_mm  # type: ignore[return-value]
+    return depth_mm
 
 
 def _size(depth_mm: NDArray[np.uint16]) -> tuple[int, int]:

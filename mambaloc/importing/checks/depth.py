@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.data.points.depth import NO_DEPTH_MM, PNG_END, read_depth_mm
+from mambaloc.data.points.depth import NO_DEPTH_MM, read_depth_mm, read_whole_png
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture, Depth
 from mambaloc.importing.checks.epipolar import apart_of
@@ -133,18 +133,13 @@ def _confidence(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     Raises:
         InputError: where it is not a whole PNG of 8 bits and that shape.
     """
-    try:
-        data = path.read_bytes()
-        whole = data.endswith(PNG_END)
-        found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
-    except (OSError, cv2.error):
-        found = None
+    found = read_whole_png(path)
     if found is None or found.dtype != np.uint8 or found.shape != shape:
         raise InputError(
             f"{path}: is no whole 8-bit PNG of one channel and the size of its depth frame, {shape[1]}x{shape[0]}. "
             "Copy the recording again, or remove the file to trust all of that frame's depth."
         )
-    return found  # type: ignore[return-value]
+    return found
 
 
 def _off_px(world_from_cam: Floats, matches: Matches, depth: Floats, focal: float, turn: float) -> Floats:

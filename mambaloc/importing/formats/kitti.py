@@ -22,6 +22,7 @@ from mambaloc.importing.formats.parsing import (
     as_numbers,
     first_with_pictures,
     number_of,
+    only_file,
     read_lines,
     read_table,
 )
@@ -89,15 +90,11 @@ def read_kitti_poses(source: Path) -> Capture:
     Raises:
         InputError: for a file that is missing or damaged, or another number of images.
     """
-    found = _bare_files(source) or [source]
-    if len(found) > 1:
-        raise InputError(f"{source}: holds {' and '.join(path.name for path in found)}; give the one to read")
-    layout = layout_of(found[0])
+    path = only_file(_bare_files(source), source)
+    layout = layout_of(path)
     if layout is not None and (layout.is_named, layout.count) != (False, 12):
-        raise InputError(
-            f"{found[0]}: does not have lines {_ROW!r}. Leave --format out, and its lines tell what it is."
-        )
-    return read_in_order(found[0], layout or Layout(False, False, 12), "kitti_poses", _CHOICES)
+        raise InputError(f"{path}: does not have lines {_ROW!r}. Leave --format out, and its lines tell what it is.")
+    return read_in_order(path, layout or Layout(False, False, 12), "kitti_poses", _CHOICES)
 
 
 def _poses_file(sequence: Path) -> Path:

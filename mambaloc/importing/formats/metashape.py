@@ -24,7 +24,7 @@ from mambaloc.images import CORNER_PX
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.finding import find_pictures
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, pictures_beside, read_xml
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, only_file, pictures_beside, read_xml
 from mambaloc.importing.formats.photogrammetric_lens import photogrammetric_lens
 
 _BEGINNING = 4096  # bytes
@@ -48,10 +48,7 @@ def read_metashape(source: Path, images: Path | None = None) -> Capture:
     Raises:
         InputError: for a file that is malformed, a camera that cannot be one, or where no picture is there.
     """
-    files = _files(source) or [source]
-    if len(files) > 1:
-        raise InputError(f"{source}: holds {' and '.join(each.name for each in files)}; give the one to read")
-    path = files[0]
+    path = only_file(_files(source), source)
     chunk, said = _largest_chunk(path)
     aligned = [camera for camera in chunk.iterfind("cameras//camera") if camera.find("transform") is not None]
     if not aligned:

@@ -194,6 +194,18 @@ def first_with_pictures(folders: Sequence[Path]) -> Path:
     raise InputError(f"{names}: none holds a picture ({', '.join(PICTURES)}); put the images there")
 
 
+def only_file(found: Iterable[Path], source: Path) -> Path:
+    """The one file of a format that was found at a source; the source itself where none was.
+
+    Raises:
+        InputError: where there are several.
+    """
+    files = list(found) or [source]
+    if len(files) > 1:
+        raise InputError(f"{source}: holds {' and '.join(each.name for each in files)}; give the one to read")
+    return files[0]
+
+
 def folder_name(folder: Path) -> str:
     """What a folder is called, also where it is given as ``.``."""
     return folder.resolve().name or "recording"

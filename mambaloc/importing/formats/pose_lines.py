@@ -28,7 +28,7 @@ from mambaloc.importing.formats.builder import (
 )
 from mambaloc.importing.formats.finding import count_there, find_pictures
 from mambaloc.importing.formats.map_free import cameras_by_picture
-from mambaloc.importing.formats.parsing import Table, first_with_pictures, folder_name, pictures_beside
+from mambaloc.importing.formats.parsing import Table, first_with_pictures, folder_name, only_file, pictures_beside
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS, Layout, layout_of, matrices_of, pose_files, read_rows
 from mambaloc.importing.formats.timing import pair
 
@@ -57,11 +57,10 @@ def read_pose_lines(source: Path, direction: Direction | None = None, images: Pa
         InputError: for a file that is damaged, can be read in more ways than one, or does not fit its pictures.
     """
     found = _files(source)
-    if len(found) > 1:
-        raise InputError(f"{source}: holds {' and '.join(path.name for path in found)}; give the one to read")
     if not found:
         raise InputError(f"{source}: has no lines of poses: 12 or 16 numbers of a matrix, or a name and 7. {_TABLE}")
-    ((path, layout),) = found.items()
+    path = only_file(found, source)
+    layout = found[path]
     if not layout.is_named and layout.count == 7:
         raise InputError(f"{path}: has 7 numbers a line, which do not say whose pose each is. {_TABLE}")
     if not layout.is_named:

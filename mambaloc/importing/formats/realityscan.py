@@ -27,7 +27,7 @@ from mambaloc.images import CORNER_PX, stored_size
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.finding import find_pictures
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, pictures_beside, read_text
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, only_file, pictures_beside, read_text
 from mambaloc.importing.formats.photogrammetric_lens import photogrammetric_lens
 from mambaloc.runtime.rotations import rigid_transforms
 from mambaloc.text import natural, open_text
@@ -65,10 +65,7 @@ def read_realityscan(source: Path, images: Path | None = None) -> Capture:
     Raises:
         InputError: for a table that is malformed, a camera that cannot be one, or where no picture is there.
     """
-    files = _files(source) or [source]
-    if len(files) > 1:
-        raise InputError(f"{source}: holds {' and '.join(each.name for each in files)}; give the one to read")
-    path = files[0]
+    path = only_file(_files(source), source)
     rows = _rows(path)
     folder = images or path.parent
     found = find_pictures(folder, [(name, f"{path}, line {line}") for line, name, _ in rows])

@@ -23,6 +23,7 @@ from mambaloc.importing.formats.parsing import (
     Table,
     first_with_pictures,
     folder_name,
+    only_file,
     pictures_beside,
     read_lines,
 )
@@ -81,13 +82,11 @@ def read_tum(source: Path) -> Capture:
     Raises:
         InputError: for a file that is missing or damaged, or where names do not tell which pose is which image's.
     """
-    found = _trajectories(source) or [source]
-    if len(found) > 1:
-        raise InputError(f"{source}: holds {' and '.join(path.name for path in found)}; give the one to read")
-    table, layout = _read_trajectory(found[0])
-    images = pictures(first_with_pictures([found[0].parent / name for name in IMAGE_FOLDERS]))
+    path = only_file(_trajectories(source), source)
+    table, layout = _read_trajectory(path)
+    images = pictures(first_with_pictures([path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, table.words, table.path)
-    return _capture("tum", found[0].parent, (table, layout), pairing.frames, pairing.how, pairing.missing, images)
+    return _capture("tum", path.parent, (table, layout), pairing.frames, pairing.how, pairing.missing, images)
 
 
 def _read_trajectory(path: Path) -> tuple[Table, Layout]:

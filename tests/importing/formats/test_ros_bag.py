@@ -10,7 +10,7 @@ import weakref
 import cv2
 import numpy as np
 import pytest
-from bag_writing import FIRST_NS, KINDS, png, recorder
+from bag_writing import FIRST_NS, KINDS, png, recording_in
 from captures import tool
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -66,13 +66,7 @@ def write_poses(bag, drive, how="odometry"):
 def record(tmp_path, monkeypatch):
     monkeypatch.setenv("MAMBALOC_CACHE", str(tmp_path / "cache"))
 
-    def record(write, kind="mcap"):
-        path = tmp_path / f"drive.{kind}" if kind == "bag" else tmp_path / "drive"
-        with recorder(path, kind) as bag:
-            write(bag)
-        return path
-
-    return record
+    return recording_in(tmp_path)
 
 
 @pytest.mark.parametrize("kind", KINDS)
