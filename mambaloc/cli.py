@@ -30,10 +30,16 @@ from mambaloc.callbacks import (
     WholeCheckpoints,
 )
 from mambaloc.console import exits_cleanly, quieten
-from mambaloc.data import PoseDataModule
+from mambaloc.data import MultiSceneDataModule, build_data
 from mambaloc.distillation import LitDistillation
 from mambaloc.errors import InputError
-from mambaloc.evaluation import evaluate_checkpoint, measure_map_of_run, print_table
+from mambaloc.evaluation import (
+    evaluate_checkpoint,
+    evaluate_scenes,
+    measure_map_of_run,
+    print_scenes,
+    print_table,
+)
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.files import read_yaml, writing
 from mambaloc.models import Checkpoint, LitPoseRegressor
@@ -93,7 +99,8 @@ class RecipeCLI(LightningCLI):
         parser.add_argument(
             "--retrieval", type=bool, default=False, help="also measure retrieval on the backbone's first features"
         )
-        parser.link_arguments("data.image_size", "model.init_args.image_size")
+        for shared in ("image_size", "scenes"):
+            parser.link_arguments(f"data.{shared}", f"model.init_args.{shared}")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Refuse a checkpoint that is none before anything reads it."""
@@ -119,6 +126,8 @@ class RecipeCLI(LightningCLI):
                 f"trainer.precision {config.trainer.precision}: pictures and poses have 32 bits, so weights must. "
                 f"Give {str(config.trainer.precision).replace('true', 'mixed')}."
             )
+        if config.data.scenes and config.map.enabled:
+            raise InputError("map.enabled true: a map is of one scene, and data.scenes names several. Set it to false.")
         if config.data.validation == "none":
             config.best_checkpoint.save_top_k = 0
 
@@ -175,18 +184,24 @@ class RecipeCLI(LightningCLI):
         found = [Checkpoint.read(path) for path in paths if path.is_file()]
         if not found:
             return
-        beside = measure_map_of_run(run_dir, found[0].data())
         retrieval = self.config[self.subcommand].retrieval
-        print_table(
-            [
+        figure = f"evaluation/{found[0].path.stem}/trajectory.png"
+        beside = None
+        if isinstance(data := found[0].data(), MultiSceneDataModule):
+            figure = str(Path(figure).parent)
+            for each in found:
+                print_scenes(evaluate_scenes(each, run_dir / "evaluation" / each.path.stem, data, with_retrieval=retrieval))
+        else:
+            beside = measure_map_of_run(run_dir, data)
+            results = [
                 evaluate_checkpoint(
                     each, run_dir / "evaluation" / each.path.stem, with_retrieval=retrieval, beside=beside
                 )
                 for each in found
             ]
-        )
+            print_table(results)
         exported = [name for name in ("model.onnx", "bundle") if (run_dir / name).exists()]
-        files = [f"evaluation/{found[0].path.stem}/trajectory.png", *exported, "checkpoints", "config.yaml"]
+        files = [figure, *exported, "checkpoints", "config.yaml"]
         print(f"wrote {run_dir}: {', '.join([str(RUN_MAP), *files] if beside else files)}")
 
 
@@ -255,7 +270,7 @@ def main(argv: list[str] | None = None, began_s: float | None = None) -> RecipeC
     with tell_refusals(argv):
         return RecipeCLI(
             LitPoseRegressor,
-            PoseDataModule,
+            build_data,
             began_s=began_s,
             parser_class=OneLineErrorParser,
             subclass_mode_model=True,

@@ -54,6 +54,7 @@ class PoseBatch:
         ``points_m`` (B, P, 3): scene points that each frame may see, world frame, NaN where it has fewer than P.
         ``intrinsics`` (B, 3, 3): pinhole matrices in pixels of ``image``, no skew; the data module always gives them.
         ``holes`` (B, H, W) bool: pixels of synthetic views that show nothing of the scene; None where there are none.
+        ``scene`` (B,): which scene of several each image shows, in whose frame its pose is; None where there is one.
     """
 
     image: Tensor
@@ -64,6 +65,7 @@ class PoseBatch:
     points_m: Tensor | None = None
     intrinsics: Tensor | None = None
     holes: Tensor | None = None
+    scene: Tensor | None = None
 
     def pin_memory(self) -> PoseBatch:
         """Copy to page-locked memory; the DataLoader calls it where ``pin_memory=True``."""
@@ -108,6 +110,8 @@ class PosePrediction:
         ``log_quaternion`` (B, 3): what a system that regresses it said; ``quaternion`` is its exponential.
         ``auxiliary``: what auxiliary heads say while training.
         ``cells``: what a dense head's cells say, out of which it solves the pose.
+        ``scene_logits`` (B, S): of a network that knows several scenes, how each fits the image. The pose is in the frame
+        of the scene that it was asked for, or else of the likeliest one.
     """
 
     position_m: Tensor
@@ -115,3 +119,4 @@ class PosePrediction:
     log_quaternion: Tensor | None = None
     auxiliary: tuple[PosePrediction, ...] = ()
     cells: CellPrediction | None = None
+    scene_logits: Tensor | None = None

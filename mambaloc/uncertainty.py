@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mambaloc.data import PoseDataModule
+from mambaloc.data import MultiSceneDataModule, PoseDataModule
 from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
 from mambaloc.metrics import error_table
@@ -135,10 +135,10 @@ class UncertaintyHead(nn.Module):
         return radius_B2[:, 0], radius_B2[:, 1], distance / self.familiar
 
 
-def fit_uncertainty(system: LitPoseRegressor, data: PoseDataModule) -> UncertaintyHead:
+def fit_uncertainty(system: LitPoseRegressor, data: PoseDataModule | MultiSceneDataModule) -> UncertaintyHead:
     """Measure how a system's errors grow with the distance to the training images, on its validation frames.
 
-    Where the best epoch was chosen on them, they flatter it a little.
+    Of several scenes, images are compared with those of all: one that is unfamiliar shows none of them. Where the best epoch was chosen on them, they flatter it a little.
 
     Args:
         system: trained; left as it was.
@@ -169,23 +169,43 @@ def uncertainty_of_test(system: LitPoseRegressor, data: PoseDataModule) -> Uncer
         return Uncertainty(*head(seen_of(network, (batch.image for batch in data.batches("test")))))
 
 
-def head_and_held_out(system: LitPoseRegressor, data: PoseDataModule) -> tuple[UncertaintyHead, ErrorsByDistance]:
+def head_and_held_out(
+    system: LitPoseRegressor, data: PoseDataModule | MultiSceneDataModule
+) -> tuple[UncertaintyHead, ErrorsByDistance]:
     """Make a head of training images, and measure what it is to be calibrated on.
 
     The arguments and errors are those of :func:`fit_uncertainty`.
     """
-    _check_held_out(system, data)
     network = copy.deepcopy(system.network).cpu().float().eval()
-    rows = data.frames("train").evenly_spread(_REFERENCES)
-    head = UncertaintyHead(seen_of(network, (batch.image for batch in data.batches("train", rows))))
-    return head, errors_by_distance(network, head, data, "val")
+    scenes, seen = data.each_scene(), []
+    for each, trained_on in zip(scenes, _trained_on(system, len(scenes)), strict=True):
+        _check_held_out(each, trained_on)
+        rows = each.frames("train").evenly_spread(_REFERENCES)
+        seen.append(seen_of(network, (batch.image for batch in each.batches("train", rows))))
+    head = UncertaintyHead(torch.cat(seen))
+    return head, _together([errors_by_distance(network, head, each, "val") for each in scenes])
 
 
-def _check_held_out(system: LitPoseRegressor, data: PoseDataModule) -> None:
+def _trained_on(system: LitPoseRegressor, scenes: int) -> list[str | None]:
+    """Digests of each scene's training frames, where the system says them."""
+    data = system.provenance.get("data", {})
+    told = list(data["scenes"].values()) if "scenes" in data else [data]
+    digests = [each.get("fingerprints", {}).get("train") for each in told]
+    return digests if len(digests) == scenes else [None] * scenes
+
+
+def _together(scenes: list[ErrorsByDistance]) -> ErrorsByDistance:
+    """Frames of all scenes whose scene was recognised: of the others the errors are infinite."""
+    parts = [(each.distance, each.position_error_m, each.rotation_error_deg) for each in scenes]
+    distance, position_m, rotation_deg = (torch.cat(each) for each in zip(*parts, strict=True))
+    is_recognised = position_m.isfinite()
+    return ErrorsByDistance(*(each[is_recognised] for each in (distance, position_m, rotation_deg)))
+
+
+def _check_held_out(data: PoseDataModule, trained_on: str | None) -> None:
     validation = data.hparams["validation"]
     if validation in ("none", "test_set"):
         raise InputError(f"data.validation {validation}: how sure a pose is needs held-out frames; train with auto")
-    trained_on = system.provenance.get("data", {}).get("fingerprints", {}).get("train")
     if trained_on is not None:  # else nothing need be decoded
         data.setup("fit")
     if trained_on is None or trained_on != data.describe()["fingerprints"]["train"]:

@@ -50,7 +50,8 @@ class MapBuild(L.Callback):
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Build, or find it built."""
         data = trainer.datamodule  # type: ignore[attr-defined]
-        is_due = data.hparams["dataset"] == CAPTURE if self.enabled is None else self.enabled
+        is_capture = len(data.each_scene()) == 1 and data.hparams["dataset"] == CAPTURE
+        is_due = is_capture if self.enabled is None else self.enabled
         if not is_due or trainer.fast_dev_run or not trainer.is_global_zero:  # type: ignore[attr-defined]
             return
         path, frames = Path(trainer.default_root_dir) / RUN_MAP, data.frames("train")

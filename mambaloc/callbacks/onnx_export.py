@@ -9,7 +9,7 @@ import lightning as L
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation.with_map import RUN_MAP
-from mambaloc.export import contract_of, export_onnx, write_bundle
+from mambaloc.export import contract_of_training, export_onnx, write_bundle
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.uncertainty import fit_uncertainty
 
@@ -50,7 +50,5 @@ class OnnxExport(L.Callback):
             uncertainty, told = fit_uncertainty(system, data), "tells how sure it is"
         except InputError as error:
             uncertainty, told = None, f"tells no uncertainty: {error}"
-        parity = export_onnx(
-            system, path, contract_of(system, data.hparams, uncertainty, data.world, data.undistortion), uncertainty
-        )
+        parity = export_onnx(system, path, contract_of_training(system, data, uncertainty), uncertainty)
         print(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch; {told}")

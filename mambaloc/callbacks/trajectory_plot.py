@@ -6,6 +6,7 @@ from pathlib import Path
 
 import lightning as L
 
+from mambaloc.data import MultiSceneDataModule
 from mambaloc.models import LitPoseRegressor
 from mambaloc.viz.trajectory import draw_trajectory
 
@@ -26,6 +27,8 @@ class TrajectoryPlot(L.Callback):
         if not due or trainer.sanity_checking or trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         assert isinstance(pl_module, LitPoseRegressor)
+        if isinstance(trainer.datamodule, MultiSceneDataModule):  # type: ignore[attr-defined]
+            return  # their frames have no frame of reference in common
         table = pl_module.val_errors.table()  # on every rank: it gathers
         if trainer.is_global_zero:
             sequences = trainer.datamodule.frames("val").sequences  # type: ignore[attr-defined]

@@ -10,7 +10,7 @@ from mambaloc.viz.views import draw_views
 
 
 class ViewSheet(L.Callback):
-    """Draw synthetic views beside real frames to ``RUN/views.png``, where there are views.
+    """Draw synthetic views beside real frames to ``RUN/views.png``, where there are views; of several scenes, a file each.
 
     Views that were found not worth training on are drawn, too: the sheet shows why.
 
@@ -23,9 +23,12 @@ class ViewSheet(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Draw, before the first step."""
-        made = trainer.datamodule.scene_views  # type: ignore[attr-defined]
-        if made is None or not self.enabled or trainer.fast_dev_run or not trainer.is_global_zero:  # type: ignore[attr-defined]
+        if not self.enabled or trainer.fast_dev_run or not trainer.is_global_zero:  # type: ignore[attr-defined]
             return
-        path = Path(trainer.default_root_dir) / "views.png"
-        draw_views(made.source, made.views, made.quality, path, f"{made.kind} depth of {len(made.source)} frames")
-        print(f"{path}: {made.summary()}", flush=True)
+        scenes = trainer.datamodule.each_scene()  # type: ignore[attr-defined]
+        for made, number in ((each.scene_views, each.scene_index) for each in scenes):
+            if made is None:
+                continue
+            path = Path(trainer.default_root_dir) / ("views.png" if number is None else f"views_{number}.png")
+            draw_views(made.source, made.views, made.quality, path, f"{made.kind} depth of {len(made.source)} frames")
+            print(f"{path}: {made.summary()}", flush=True)

@@ -8,9 +8,16 @@ from pathlib import Path
 
 from mambaloc.cli import OneLineErrorParser
 from mambaloc.console import exits_cleanly, quieten
-from mambaloc.data import PoseDataModule
+from mambaloc.data import MultiSceneDataModule, build_data
 from mambaloc.errors import InputError
-from mambaloc.evaluation import evaluate_checkpoint, measure_map, measure_map_of_run, print_table
+from mambaloc.evaluation import (
+    evaluate_checkpoint,
+    evaluate_scenes,
+    measure_map,
+    measure_map_of_run,
+    print_scenes,
+    print_table,
+)
 from mambaloc.models import Checkpoint
 
 
@@ -28,7 +35,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--map", type=Path, metavar="FILE", help="measure it beside the network; the run's unless given"
     )
-    parser.add_class_arguments(PoseDataModule, "data")
+    parser.add_function_arguments(build_data, "data")
     path = parser.parse_args(argv, defaults=False).checkpoint
     if path is None:
         raise InputError("evaluate.py needs a checkpoint: evaluate.py RUN/checkpoints/best.ckpt")
@@ -37,7 +44,13 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     run = path.parent.parent
     out = args.out or run / "evaluation" / path.stem
-    data = PoseDataModule(**args.data)
+    data = build_data(**args.data)
+    if isinstance(data, MultiSceneDataModule):
+        if args.map:
+            raise InputError(f"--map {args.map}: is of one scene, and this network knows several. Leave it out.")
+        print_scenes(evaluate_scenes(checkpoint, out, data, args.accelerator, args.retrieval))
+        print(f"{out}: a folder a scene, each with metrics.json, predictions.csv, predictions.tum, trajectory.png")
+        return
     beside = measure_map(args.map, data) if args.map else measure_map_of_run(run, data)
     print_table([evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval, beside)])
     both = ", predictions_both.csv, predictions_both.tum" if beside else ""

@@ -4,7 +4,8 @@ from pathlib import Path
 
 from mambaloc.cli import OneLineErrorParser
 from mambaloc.console import exits_cleanly, quieten
-from mambaloc.data import PoseDataModule
+from mambaloc.data import MultiSceneDataModule, build_data
+from mambaloc.errors import InputError
 from mambaloc.evaluation.figures import FIGURES, draw_figures
 from mambaloc.evaluation.trained import Trained, load_trained
 from mambaloc.models import Checkpoint
@@ -19,7 +20,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("checkpoints", type=Path, nargs="+", metavar="CHECKPOINT")
     parser.add_argument("--out", type=Path, help="folder of the figures; RUN/figures/EPOCH of the first unless given")
     parser.add_argument("--frames", type=int, default=3, help="how many test frames are shown, evenly spaced")
-    parser.add_class_arguments(PoseDataModule, "data")
+    parser.add_function_arguments(build_data, "data")
     args = parser.parse_args(argv, defaults=False)
     trained = [_trained(parser, argv, path) for path in args.checkpoints]
     first = args.checkpoints[0]
@@ -32,4 +33,7 @@ def _trained(parser: OneLineErrorParser, argv: list[str] | None, path: Path) -> 
     """Load a checkpoint with its own recipe's data under the options that were given."""
     checkpoint = Checkpoint.read(path)
     parser.set_defaults({f"data.{name}": value for name, value in checkpoint.data().hparams.items()})
-    return load_trained(checkpoint, PoseDataModule(**parser.parse_args(argv).data))
+    data = build_data(**parser.parse_args(argv).data)
+    if isinstance(data, MultiSceneDataModule):
+        raise InputError(f"{path}: knows several scenes, which have no figure in common. mambaloc evaluate draws each.")
+    return load_trained(checkpoint, data)

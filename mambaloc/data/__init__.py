@@ -7,16 +7,19 @@ if TYPE_CHECKING:
     from mambaloc.data.datamodule import PoseDataModule
     from mambaloc.data.datasets.registry import DATASETS
     from mambaloc.data.frames import BadFrames, Frames
+    from mambaloc.data.multi_scene import MultiSceneDataModule, build_data
 
 # Imported on first use: downloading or rendering a scene needs no torch.
 _EXPORTS = {
     "BadFrames": "mambaloc.data.frames",
     "DATASETS": "mambaloc.data.datasets.registry",
     "Frames": "mambaloc.data.frames",
+    "MultiSceneDataModule": "mambaloc.data.multi_scene",
     "PoseDataModule": "mambaloc.data.datamodule",
+    "build_data": "mambaloc.data.multi_scene",
 }
 
-__all__ = ["DATASETS", "BadFrames", "Frames", "PoseDataModule"]
+__all__ = ["DATASETS", "BadFrames", "Frames", "MultiSceneDataModule", "PoseDataModule", "build_data"]
 
 
 def __getattr__(name: str) -> Any:

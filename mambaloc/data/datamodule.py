@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +109,10 @@ class PoseDataModule(L.LightningDataModule):
         cache_dir: str | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters()
+        image_size = image_size if isinstance(image_size, int) else list(image_size)  # type: ignore[assignment]
+        self.save_hyperparameters()  # as the model keeps its image size: Lightning compares the two
+        for several in ("scenes", "scene_share"):  # of a recipe's data; this is one scene
+            self.hparams.pop(several, None)
         self.scene = Scene(**{field.name: self.hparams[field.name] for field in fields(Scene)})
         # LightningCLI has given what the recipe says; what is kept, and told, is what that means.
         self.hparams.update(dataset=self.scene.dataset, root=self.scene.root, scene=self.scene.scene)
@@ -122,6 +125,7 @@ class PoseDataModule(L.LightningDataModule):
         self.augmentation = ways[augmentation]
         if augmentation_draws is not None and augmentation_draws < 1:
             raise InputError(f"data.augmentation_draws {augmentation_draws}: must be 1 or more, or null")
+        self.scene_index: int | None = None  # among those of a MultiSceneDataModule
         self._resident: dict[Split, CachedFrames] = {}
         self._uniforms: tuple[tuple[int, int, torch.device], Tensor] | None = None
 
@@ -139,6 +143,15 @@ class PoseDataModule(L.LightningDataModule):
     def undistortion(self) -> Undistortion:
         """How the scene's pictures were made of what their camera stored."""
         return undistortion_of(self.folder)
+
+    def each_scene(self) -> list[PoseDataModule]:
+        """This scene's data module: :class:`~mambaloc.data.MultiSceneDataModule` has several."""
+        return [self]
+
+    @property
+    def training_batches(self) -> int:
+        """Batches of an epoch."""
+        return len(self.train_dataloader())
 
     def setup(self, stage: str) -> None:
         """Read and decode what a stage needs; every process may, since the cache is built by one of them."""
@@ -229,13 +242,17 @@ class PoseDataModule(L.LightningDataModule):
         frames = CachedFrames(loaded.frames, loaded.images, loaded.cameras, loaded.points)  # no clips
         rows = range(len(frames)) if rows is None else rows
         for start in range(0, len(rows), size):
-            yield centered(frames.__getitems__(list(rows[start : start + size])), self.crop)
+            yield self._of_scene(centered(frames.__getitems__(list(rows[start : start + size])), self.crop))
 
     def on_after_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
         """Crop on the device; while training, augment. Intrinsics follow, and the pose where the camera turns."""
         if self.trainer is None or not self.trainer.training:
-            return centered(batch, self.crop)
-        return self.augmented(batch, self.trainer.current_epoch)
+            return self._of_scene(centered(batch, self.crop))
+        return self._of_scene(self.augmented(batch, self.trainer.current_epoch))
+
+    def _of_scene(self, batch: PoseBatch) -> PoseBatch:
+        """Say which scene the images show, where it is one of several."""
+        return batch if self.scene_index is None else replace(batch, scene=torch.full_like(batch.index, self.scene_index))
 
     def augmented(self, batch: PoseBatch, epoch: int) -> PoseBatch:
         """View and colour training images as chance has it, which depends on (seed, epoch, row) alone."""

@@ -66,6 +66,7 @@ def evaluate_checkpoint(
     both = beside.beside(table, lambda: uncertainty_of_test(system, data)) if beside else None
     result = {
         "metrics": summarise(table),
+        **({} if data.scene_index is None else {"recognised": table.position_error_m.isfinite().float().mean().item()}),
         "count": len(table.index),
         "data": data.describe(),
         "split": "test",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,15 +15,7 @@ def print_table(results: Sequence[dict[str, Any]]) -> None:
     """Print what :func:`~mambaloc.evaluation.evaluate_checkpoint` returned, a row a checkpoint."""
     data = results[0]["data"]
     benchmark = "official split" if data["official_split"] else "not an official benchmark split"
-    table = Table(
-        title=f"{data['dataset']}/{data['scene']}: {results[0]['count']} test frames, {benchmark}",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        show_edge=False,
-        pad_edge=False,
-        padding=(0, 0),
-    )
-    table.add_column("", no_wrap=True)
+    table = _table(f"{data['dataset']}/{data['scene']}: {results[0]['count']} test frames, {benchmark}")
     for column in ("median", "mean", "worst", "5cm 5°", "25cm 2°", "50cm 5°"):
         table.add_column(column, justify="right", no_wrap=True)
     for result in results:
@@ -49,10 +42,36 @@ def print_table(results: Sequence[dict[str, Any]]) -> None:
         console.print("skipped frames: " + ", ".join(f"{part} {count}" for part, count in skipped.items()))
 
 
+def print_scenes(results: dict[str, dict[str, Any]]) -> None:
+    """Print what :func:`~mambaloc.evaluation.evaluate_scenes` returned, a row a scene, and the mean over them."""
+    first = next(iter(results.values()))
+    frames = sum(each["count"] for each in results.values())
+    table = _table(f"{first['selection'].split(':')[0]} (epoch {first['training']['epoch']}): {frames} test frames")
+    for name in ("median", "mean", "25cm 2°", "50cm 5°", "recognised"):
+        table.add_column(name, justify="right", no_wrap=True)
+    rows = {name: {**each["metrics"], "recognised": each["recognised"]} for name, each in results.items()}
+    mean = {key: statistics.fmean(row[key] for row in rows.values()) for key in next(iter(rows.values()))}
+    for name, row in {**rows, "[bold]mean of scenes": mean}.items():
+        shares = (f"{row[key]:.0%}" for key in ("recall_25cm_2deg", "recall_50cm_5deg", "recognised"))
+        table.add_row(name, _medians(row), _means(row), *shares)
+    Console(highlight=False).print(table)
+
+
+def _table(title: str) -> Table:
+    table = Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 0)
+    )
+    table.add_column("", no_wrap=True)
+    return table
+
+
+def _means(metrics: dict[str, float]) -> str:
+    return _pose(metrics["position_error_mean_m"], metrics["rotation_error_mean_deg"])
+
+
 def _cells(metrics: dict[str, float]) -> list[str]:
-    means = _pose(metrics["position_error_mean_m"], metrics["rotation_error_mean_deg"])
     recalls = (f"{metrics[name]:.0%}" for name in ("recall_5cm_5deg", "recall_25cm_2deg", "recall_50cm_5deg"))
-    return [_medians(metrics), means, f"{metrics['position_error_worst_m']:.2f}m", *recalls]
+    return [_medians(metrics), _means(metrics), f"{metrics['position_error_worst_m']:.2f}m", *recalls]
 
 
 def _medians(metrics: dict[str, float]) -> str:

@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Console
 
-from mambaloc.data import PoseDataModule
+from mambaloc.data import MultiSceneDataModule, PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.export.maps import check_scene, describe_map, map_vector
-from mambaloc.export.onnx import contract_of, export_onnx
+from mambaloc.export.onnx import contract_of_training, export_onnx
 from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
 from mambaloc.export.preprocessing import with_preprocessing
@@ -57,7 +57,7 @@ class WrittenBundle:
 
 def write_bundle(
     system: LitPoseRegressor,
-    data: PoseDataModule,
+    data: PoseDataModule | MultiSceneDataModule,
     out: Path,
     formats: Sequence[str] = ("onnx", "fp16"),
     target: str = "android",
@@ -75,7 +75,7 @@ def write_bundle(
         formats: of ``FORMATS``.
         target: of ``TARGETS``, which its page on integration is about.
         raw_input: resize, crop and scale inside of the models, which then take RGB of any size.
-        sparse_map: file of a map of the scene, which is copied into the bundle.
+        sparse_map: file of a map of the scene, which is copied into the bundle; of several scenes there is none.
 
     Raises:
         InputError: where the folder is there or cannot be written, the test frames are not there, a model deviates, the
@@ -83,6 +83,10 @@ def write_bundle(
     """
     if out.exists():
         raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
+    scenes = data.each_scene()
+    if isinstance(data, MultiSceneDataModule) and (sparse_map or "int8" in formats):
+        what = f"{sparse_map}: a map is of one scene" if sparse_map else "--to int8: is decided on one scene's frames"
+        raise InputError(f"{what}, and this network knows {len(scenes)}. Leave it out.")
     data.setup("test")
     status = Console(stderr=True).status(f"exporting {system.registry_name}")
     with status, whole_folder(out, "choose another folder with --out") as partial:
@@ -90,16 +94,17 @@ def write_bundle(
             uncertainty, unsure = fit_uncertainty(system, data), None
         except InputError as error:
             uncertainty, unsure = None, f"the models tell no uncertainty: {error}"
-        in_map = None if sparse_map is None else _copy_map(sparse_map, data, partial)
+        in_map = None if sparse_map is None else _copy_map(sparse_map, scenes[0], partial)
         contract, int8 = _write_models(system, data, partial, formats, raw_input, uncertainty)
         written = [name for name in formats if (partial / MODEL_FILES[name]).is_file()]
         if not written:
             raise InputError(f"{out}: nothing to write: {int8}")
         frames = _write_frames(system, data, partial, contract, in_map)
-        _write_trajectory(data, partial)
-        size_m = max(1.0, float(system.network.head.position_scale.scale_m))
+        if len(scenes) == 1:  # others have no frame of reference in common
+            _write_trajectory(scenes[0], partial)
+        size_m = max(1.0, float(system.network.head.position_scale.scale_m.max()))
         models = [MODEL_FILES[name] for name in written]
-        write_pages(partial, contract, data.hparams["dataset"], models, target, None if in_map is None else in_map.map)
+        write_pages(partial, contract, scenes[0].hparams["dataset"], models, target, None if in_map is None else in_map.map)
         described = {} if in_map is None else {"map": describe_map(in_map.map)}
         _write_contract(partial, contract, frames, written, size_m, int8, described)
         deviations = verify_bundle(partial)
@@ -118,18 +123,18 @@ def _copy_map(path: Path, data: PoseDataModule, folder: Path) -> MapLocaliser:
 
 def _write_models(
     system: LitPoseRegressor,
-    data: PoseDataModule,
+    data: PoseDataModule | MultiSceneDataModule,
     folder: Path,
     formats: Sequence[str],
     raw_input: bool,
     uncertainty: UncertaintyHead | None,
 ) -> tuple[Contract, EightBit | None]:
-    plain = contract_of(system, data.hparams, uncertainty, data.world, data.undistortion)
+    plain = contract_of_training(system, data, uncertainty)
     contract = replace(plain, preprocessing=replace(plain.preprocessing, in_model=raw_input))
     network = folder / MODEL_FILES["onnx"]
     export_onnx(system, network, plain, uncertainty)
     model = onnx.load(network)
-    int8 = eight_bit(model, data) if "int8" in formats else None
+    int8 = eight_bit(model, data.each_scene()[0]) if "int8" in formats else None
     models, focal_px = {"onnx": model}, contract.intrinsics[0][0] if contract.intrinsics else None
     if "fp16" in formats:
         models["fp16"] = half_precision(model)
@@ -152,17 +157,23 @@ def _tell(model: onnx.ModelProto, contract: Contract) -> None:
 
 
 def _write_frames(
-    system: LitPoseRegressor, data: PoseDataModule, folder: Path, contract: Contract, in_map: MapLocaliser | None
+    system: LitPoseRegressor,
+    data: PoseDataModule | MultiSceneDataModule,
+    folder: Path,
+    contract: Contract,
+    in_map: MapLocaliser | None,
 ) -> list[dict[str, Any]]:
     """Write test frames, evenly spread, with the poses that the system itself finds, and those that its map finds.
 
     For a system that takes intrinsics there is one of another lens besides: a part of the first frame, not its middle.
     As PNG: no two decoders agree on a JPEG.
     """
-    frames = data.frames("test")
-    rows = frames.evenly_spread(_FRAMES)
-    pictures = [read_image(frames.image_paths[row]) for row in rows]
-    cameras = data.scene.parts["test"].data.cameras.intrinsics[rows]
+    pictures, cameras = [], np.empty((0, 3, 3))
+    for each in data.each_scene():
+        frames = each.frames("test")
+        rows = frames.evenly_spread(max(1, _FRAMES // len(data.each_scene())))
+        pictures += [read_image(frames.image_paths[row]) for row in rows]
+        cameras = np.concatenate([cameras, each.scene.parts["test"].data.cameras.intrinsics[rows]])
     if contract.intrinsics is not None:
         left = pictures[0].shape[1] // 8
         pictures.append(pictures[0][:, left:])

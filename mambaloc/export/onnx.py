@@ -8,7 +8,7 @@ import hashlib
 import io
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,20 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim
 
+from mambaloc.data import MultiSceneDataModule, PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
 from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork, PositionScale
-from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, METADATA_KEY, Contract, Preprocessing
+from mambaloc.runtime.contract import (
+    IMAGE_INPUT,
+    INTRINSICS_INPUT,
+    METADATA_KEY,
+    Contract,
+    Preprocessing,
+    SceneFrame,
+)
 from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
 from mambaloc.uncertainty import UncertaintyHead, pooled
@@ -42,12 +50,14 @@ class Parity:
         rotation_deg: of rotations.
         reach_m: largest distance from the scene's origin that PyTorch said; float32 rounds in proportion to it.
         uncertainty: of radii and unfamiliarity, over PyTorch's; 0 for a model that tells none.
+        scene: of scenes' probabilities; 0 for a model that knows one.
     """
 
     position_m: float
     rotation_deg: float
     reach_m: float
     uncertainty: float = 0.0
+    scene: float = 0.0
 
 
 class DeployedNetwork(nn.Module):
@@ -60,7 +70,7 @@ class DeployedNetwork(nn.Module):
     Shape:
         (B, 3, H, W) in 0..1, and for a network that takes them intrinsics (B, 3, 3) in its pixels -> (B, 3) in metres
         and (B, 4) unit wxyz with ``w >= 0``; with ``uncertainty`` three of (B,) follow, those of
-        :class:`~mambaloc.uncertainty.UncertaintyHead`.
+        :class:`~mambaloc.uncertainty.UncertaintyHead`; of a network that knows S scenes their probabilities, (B, S).
     """
 
     def __init__(self, network: PoseNetwork, uncertainty: UncertaintyHead | None = None) -> None:
@@ -71,8 +81,12 @@ class DeployedNetwork(nn.Module):
         """Localise images."""
         feats = self.network.forward_backbone(image)
         prediction = self.network.forward_head(self.network.features(feats), intrinsics)
-        pose = (prediction.position_m, canonical(prediction.quaternion))
-        return pose if self.uncertainty is None else (*pose, *self.uncertainty(pooled(feats)))
+        outputs: tuple[Tensor, ...] = (prediction.position_m, canonical(prediction.quaternion))
+        if self.uncertainty is not None:
+            outputs += self.uncertainty(pooled(feats))
+        if prediction.scene_logits is not None:
+            outputs += (prediction.scene_logits.softmax(dim=-1),)
+        return outputs
 
 
 def export_onnx(
@@ -104,7 +118,7 @@ def export_onnx(
         parity = check_parity(deployed, partial, system.image_size)
         size_m = max(1.0, _largest_position_m(deployed), parity.reach_m)
         is_close = parity.position_m <= tolerance_m * size_m and parity.rotation_deg <= tolerance_deg
-        if not (is_close and parity.uncertainty <= _TOLERANCE):
+        if not (is_close and parity.uncertainty <= _TOLERANCE and parity.scene <= _TOLERANCE):
             raise InputError(
                 f"{path}: ONNX Runtime differs from PyTorch by {parity.position_m:.2g} m, "
                 f"{parity.rotation_deg:.2g} deg and {parity.uncertainty:.1%} of a radius, so it was not written; "
@@ -119,6 +133,7 @@ def contract_of(
     uncertainty: UncertaintyHead | None = None,
     world: World | None = None,
     undistortion: Undistortion | None = None,
+    scenes: Sequence[SceneFrame] = (),
 ) -> Contract:
     """Say what a system's exported network promises.
 
@@ -128,9 +143,10 @@ def contract_of(
         uncertainty: that the model will tell.
         world: of the scene; without a shift unless given.
         undistortion: of the scene's pictures; with no lens known unless given.
+        scenes: that the network knows, where there are several.
     """
     preprocessing = Preprocessing(data["short_side"], system.image_size)
-    scene = f"{data['dataset']}/{data['scene']}"
+    scene = ", ".join(each.name for each in scenes) or f"{data['dataset']}/{data['scene']}"
     weights, radii = weights_sha256(system.network), None if uncertainty is None else uncertainty.describe()
     intrinsics = None
     if system.network.takes_intrinsics:
@@ -146,7 +162,28 @@ def contract_of(
         intrinsics,
         world=world or World(),
         undistortion=undistortion or Undistortion(),
+        scenes=tuple(scenes),
     )
+
+
+def contract_of_training(
+    system: LitPoseRegressor,
+    data: PoseDataModule | MultiSceneDataModule,
+    uncertainty: UncertaintyHead | None = None,
+) -> Contract:
+    """Say what the exported network of a training promises, of one scene or of several.
+
+    Args:
+        system: trained.
+        data: what it was trained with.
+        uncertainty: that the model will tell.
+    """
+    first, *others = data.each_scene()
+    if not isinstance(data, MultiSceneDataModule):
+        return contract_of(system, first.hparams, uncertainty, first.world, first.undistortion)
+    scenes = [SceneFrame(name, world) for name, world in data.frames_of_reference]
+    undistortion = first.undistortion if all(each.undistortion == first.undistortion for each in others) else None
+    return contract_of(system, first.hparams, uncertainty, undistortion=undistortion, scenes=scenes)
 
 
 def weights_sha256(network: nn.Module) -> str:
@@ -162,7 +199,7 @@ def check_parity(deployed: DeployedNetwork, path: Path, image_size: tuple[int, i
     """Compare a file with the network it came from, on random images of several cameras in several batch sizes."""
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     generator = torch.Generator().manual_seed(seed)
-    position_m, rotation_deg, reach_m, uncertainty = [], [], [], [torch.zeros(())]
+    position_m, rotation_deg, reach_m, uncertainty, scene = [], [], [], [torch.zeros(())], [torch.zeros(())]
     for batch in _CHECKED_BATCHES:
         inputs = _random_inputs(deployed.network, batch, image_size, generator)
         with torch.inference_mode():
@@ -172,8 +209,10 @@ def check_parity(deployed: DeployedNetwork, path: Path, image_size: tuple[int, i
         position_m.append((actual_m - expected_m).norm(dim=-1).max())
         rotation_deg.append(rotation_error_deg(actual_q, expected_q).max())
         reach_m.append(expected_m.norm(dim=-1).max())
+        if deployed.network.scenes > 1:
+            scene.append((actual.pop() - expected.pop()).abs().max())
         uncertainty += [((a - e).abs() / e.clamp_min(1e-6)).max() for a, e in zip(actual, expected, strict=True)]
-    differences = (position_m, rotation_deg, reach_m, uncertainty)
+    differences = (position_m, rotation_deg, reach_m, uncertainty, scene)
     return Parity(*(torch.stack(each).max().item() for each in differences))  # NaN stays NaN
 
 
@@ -225,5 +264,5 @@ def _quiet():  # type: ignore[no-untyped-def]
 
 
 def _largest_position_m(deployed: nn.Module) -> float:
-    scales = [m.scale_m.item() + m.mean_m.norm().item() for m in deployed.modules() if isinstance(m, PositionScale)]
-    return max(scales, default=1.0)
+    scales = [m.scale_m + m.mean_m.norm(dim=-1) for m in deployed.modules() if isinstance(m, PositionScale)]
+    return max((each.max().item() for each in scales), default=1.0)

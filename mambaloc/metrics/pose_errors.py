@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -68,7 +68,8 @@ class PoseErrorTable:
 class PoseErrors(Metric):
     """Collect every frame's prediction; correct under DDP, where a median of medians would not be.
 
-    Frames that a distributed sampler repeats are counted once.
+    Frames that a distributed sampler repeats are counted once. A pose in another scene's frame is no pose: its errors are
+    infinite.
     """
 
     full_state_update = False
@@ -77,6 +78,7 @@ class PoseErrors(Metric):
     predicted_quaternion: list[Tensor]
     true_position_m: list[Tensor]
     true_quaternion: list[Tensor]
+    is_recognised: list[Tensor]
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,6 +88,7 @@ class PoseErrors(Metric):
             "predicted_quaternion",
             "true_position_m",
             "true_quaternion",
+            "is_recognised",
         ):
             self.add_state(state, default=[], dist_reduce_fx="cat")
 
@@ -96,6 +99,10 @@ class PoseErrors(Metric):
         self.predicted_quaternion.append(prediction.quaternion.detach().float())
         self.true_position_m.append(target.position_m)
         self.true_quaternion.append(target.quaternion)
+        is_recognised = torch.ones_like(target.index, dtype=torch.bool)
+        if prediction.scene_logits is not None and target.scene is not None:
+            is_recognised = prediction.scene_logits.argmax(dim=-1) == target.scene
+        self.is_recognised.append(is_recognised)
 
     def compute(self) -> dict[str, float]:
         """Reduce the whole split; see :func:`summarise`."""
@@ -112,7 +119,13 @@ class PoseErrors(Metric):
         first = torch.full((int(order.max()) + 1,), len(index), device=index.device)
         first = first.scatter_reduce(0, order, torch.arange(len(index), device=index.device), "amin")
         poses = (self.predicted_position_m, self.predicted_quaternion, self.true_position_m, self.true_quaternion)
-        return PoseErrorTable.of(index[first], *(dim_zero_cat(state)[first] for state in poses))
+        table = PoseErrorTable.of(index[first], *(dim_zero_cat(state)[first] for state in poses))
+        is_recognised = dim_zero_cat(self.is_recognised)[first]
+        position_m, rotation_deg = (
+            torch.where(is_recognised, errors, torch.inf)
+            for errors in (table.position_error_m, table.rotation_error_deg)
+        )
+        return replace(table, position_error_m=position_m, rotation_error_deg=rotation_deg)
 
 
 def error_table(

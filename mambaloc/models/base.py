@@ -5,13 +5,16 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_args
 
 import lightning as L
 import torch
+import torch.nn.functional as F
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
+from torchmetrics import MeanMetric
 
 from mambaloc import provenance
 from mambaloc.errors import InputError
@@ -55,7 +58,11 @@ class LitPoseRegressor(L.LightningModule):
         pixel_std: RGB deviation, likewise.
         gis: the Global Information Selector of each branch: ``gis``, its ablation ``classical``, or ``none``.
         discretisation: of GIS's state space: ``euler`` or ``zoh``.
-        warm_start: checkpoint of a like network, whose weights the training starts from.
+        scenes: names of the scenes that one network learns, where there are several; recipes set them once, in ``data``.
+        warm_start: checkpoint of a like network, whose weights the training starts from. Where that knows other scenes,
+            those that both know keep their outputs.
+        new_scenes_only: train nothing but the outputs of scenes that ``warm_start`` does not know. The others are then
+            localised as before, frames of all take part, and recognition learns the new ones.
         loss: name in ``mambaloc.losses.LOSSES``.
         loss_args: that loss's arguments.
         compile_mode: run training steps through ``torch.compile`` in this mode: ``default``, or ``reduce-overhead``,
@@ -79,6 +86,9 @@ class LitPoseRegressor(L.LightningModule):
     """
 
     registry_name: ClassVar[str]
+    takes_scenes: ClassVar[bool] = False
+    """Whether one network can learn several scenes."""
+
     network: PoseNetwork
 
     def __init__(
@@ -91,7 +101,9 @@ class LitPoseRegressor(L.LightningModule):
         pixel_std: tuple[float, float, float] | None = None,
         gis: GISMode = "none",
         discretisation: Discretisation = "euler",
+        scenes: list[str] | None = None,
         warm_start: str | None = None,
+        new_scenes_only: bool = False,
         loss: str = "learned_weights",
         loss_args: dict[str, Any] | None = None,
         compile_mode: CompileMode | None = None,
@@ -124,21 +136,42 @@ class LitPoseRegressor(L.LightningModule):
             )
         if feature_cache_gib and compile_mode:
             raise InputError("model.feature_cache_gib: its steps do not run compiled. Set compile_mode to null.")
+        self.scene_count = max(1, len(scenes or ()))
+        if self.scene_count > 1 and not self.takes_scenes:
+            name = getattr(self, "registry_name", type(self).__name__)
+            raise InputError(f"model: {name} knows one scene. For data.scenes choose denseloc or multi_scene_transposenet.")
         self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode
         self._compiled: Callable[..., PosePrediction] | None = None
         self._split: tuple[SplitBackbone, FeatureCache] | None = None
-        self.val_errors, self.test_errors = PoseErrors(), PoseErrors()
+        self.val_errors, self.test_errors, self.val_loss = PoseErrors(), PoseErrors(), MeanMetric()
         self.provenance: dict[str, Any] = {}
         self.save_hyperparameters()
         self.network = self.configure_network()
         if warm_start is not None:
-            start_from(self.network, warm_start)
+            known = start_from(self.network, warm_start, scenes or [])
+            if new_scenes_only:
+                self._train_only([index for index, name in enumerate(scenes or []) if name not in known])
+        elif new_scenes_only:
+            raise InputError("model.new_scenes_only: needs model.warm_start, a checkpoint that knows the other scenes.")
         if frozen_groups:
             self.network.backbone.freeze(frozen_groups)
         if frozen_statistics:
             self.network.backbone.freeze_statistics()
         if recomputed_stages:
             recompute_stages(self.network.backbone.model, self.network.backbone.name, recomputed_stages)
+
+    def _train_only(self, new: list[int]) -> None:
+        """Freeze all but the rows of new scenes, whose gradients alone are kept."""
+        if not new:
+            raise InputError("model.new_scenes_only: the checkpoint of warm_start knows all scenes. Add one to data.scenes.")
+        self.network.requires_grad_(False)
+        self.network.backbone.freeze_statistics()
+        self.weight_decay = 0.0  # it would shrink the others' rows
+        for name, parameter in self.network.named_parameters():
+            if name.startswith(self.network.scene_tables):
+                is_new = torch.zeros(self.scene_count, 1)
+                is_new[new] = 1
+                parameter.requires_grad_(True).register_hook(partial(_gradient_of_rows, is_new))
 
     def configure_network(self) -> PoseNetwork:
         """Build the network from the hyperparameters: images in, :class:`~mambaloc.types.PosePrediction` out."""
@@ -151,12 +184,14 @@ class LitPoseRegressor(L.LightningModule):
 
     def hyperparameters_of(self, network: type[nn.Module]) -> dict[str, Any]:
         """Those of this system's hyperparameters that a network class takes, beside its backbone and image size."""
-        taken = set(inspect.signature(network).parameters) - {"backbone", "image_size"}
+        taken = set(inspect.signature(network).parameters) - {"backbone", "image_size", "scenes"}
         return {name: value for name, value in self.hparams.items() if name in taken}
 
-    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> PosePrediction:
-        """Localise images, (B, 3, H, W) in 0..1, of cameras (B, 3, 3) in pixels of them."""
-        return self.network(image, intrinsics)
+    def forward(
+        self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None
+    ) -> PosePrediction:
+        """Localise images, (B, 3, H, W) in 0..1, of cameras (B, 3, 3) in pixels of them, in given scenes (B,)."""
+        return self.network(image, intrinsics, scene)
 
     def setup(self, stage: str) -> None:
         """Take the scene's position statistics, and compile what the epochs run, before the first epoch.
@@ -174,7 +209,8 @@ class LitPoseRegressor(L.LightningModule):
         if stage == "fit" and self.normalise_position:
             for module in self.network.modules():
                 if isinstance(module, PositionScale):
-                    module.fit(self.scene_for("normalise_position").train_position_m)
+                    for index, each in enumerate(self.scene_for("normalise_position").each_scene()):
+                        module.fit(each.train_position_m, index)
         if stage == "fit" and self.compile_mode is not None:
             accumulated = self.trainer.accumulate_grad_batches
             self._compiled = compile_forward(self.network, self.compile_mode, accumulated)
@@ -210,16 +246,21 @@ class LitPoseRegressor(L.LightningModule):
         torch.manual_seed(hash((provenance.seed(), self.current_epoch, batch_idx, self.global_rank)))
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
-        """Return the loss of a batch; auxiliary heads weigh 0.3 each (Szegedy et al. 2015)."""
+        """Return the loss of a batch; auxiliary heads weigh 0.3 each (Szegedy et al. 2015).
+
+        Poses are those in the true scenes' frames; that of several is recognised, by cross-entropy.
+        """
         if self._split is None:
-            prediction = (self._compiled or self)(batch.image, batch.intrinsics)
+            prediction = (self._compiled or self)(batch.image, batch.intrinsics, batch.scene)
         else:
             split, cache = self._split
             feats = split.trained(cache(batch, self.current_epoch))
-            prediction = self.network.forward_head(self.network.features(feats), batch.intrinsics)
+            prediction = self.network.forward_head(self.network.features(feats), batch.intrinsics, batch.scene)
         loss = self.loss(prediction, batch)
         for auxiliary in prediction.auxiliary:
             loss = loss + 0.3 * self.loss(auxiliary, batch)
+        if prediction.scene_logits is not None:
+            loss = loss + F.cross_entropy(prediction.scene_logits, batch.scene)
         self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch.index), sync_dist=True)
         return loss
 
@@ -228,22 +269,23 @@ class LitPoseRegressor(L.LightningModule):
         for name, parameter in self.loss.named_parameters():
             self.log(f"train/{name}", parameter.detach(), sync_dist=True)
 
-    def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:
-        """Collect a validation batch."""
+    def validation_step(self, batch: PoseBatch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """Collect a validation batch; of several scenes there is a loader each, and all count together."""
         prediction = self(batch.image, batch.intrinsics)
         self.val_errors.update(prediction, batch)
-        self.log("val/loss", self.loss(prediction, batch), batch_size=len(batch.index), sync_dist=True)
+        self.val_loss.update(self.loss(prediction, batch).detach(), len(batch.index))
 
-    def test_step(self, batch: PoseBatch, batch_idx: int) -> None:
+    def test_step(self, batch: PoseBatch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Collect a test batch."""
         self.test_errors.update(self(batch.image, batch.intrinsics), batch)
 
-    def predict_step(self, batch: PoseBatch, batch_idx: int) -> PosePrediction:
+    def predict_step(self, batch: PoseBatch, batch_idx: int, dataloader_idx: int = 0) -> PosePrediction:
         """Localise a batch without looking at its true poses."""
         return self(batch.image, batch.intrinsics)
 
     def on_validation_epoch_end(self) -> None:
-        """Log the medians and recalls over the whole validation set."""
+        """Log the loss, and the medians and recalls, over the whole validation set."""
+        self.log("val/loss", self.val_loss.compute())
         self._log_errors("val", self.val_errors)
 
     def on_test_epoch_end(self) -> None:
@@ -256,6 +298,7 @@ class LitPoseRegressor(L.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """Forget the previous validation."""
+        self.val_loss.reset()
         self.val_errors.reset()
 
     def on_test_epoch_start(self) -> None:
@@ -278,7 +321,7 @@ class LitPoseRegressor(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": by_step, "interval": "step"}}
 
     def _steps_in_all(self) -> int:
-        batches = len(self.scene_for("schedule").train_dataloader())
+        batches = self.scene_for("schedule").training_batches
         return training_steps(self.trainer, batches, self.schedule)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -326,3 +369,8 @@ class LitPoseRegressor(L.LightningModule):
         kwargs.pop("weights_only", None)  # Lightning's option, which might ask for more
         system = build_from(read_checkpoint(checkpoint_path), cls, strict is not False, **kwargs)
         return system.to(map_location or "cpu")
+
+
+def _gradient_of_rows(is_counted: Tensor, grad: Tensor) -> Tensor:
+    """A gradient of those rows alone that count; (S, 1) of ones and zeros for (S * k, ...)."""
+    return (grad.reshape(len(is_counted), -1) * is_counted.to(grad)).view_as(grad)

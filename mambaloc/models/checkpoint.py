@@ -14,7 +14,7 @@ from mambaloc.models.registry import model_class
 from mambaloc.models.weights import build_from, read_checkpoint
 
 if TYPE_CHECKING:
-    from mambaloc.data import PoseDataModule
+    from mambaloc.data import MultiSceneDataModule, PoseDataModule
 
 
 _FORMER_AUGMENTATION = ("focal_ratio",)
@@ -52,8 +52,8 @@ class Checkpoint:
         """
         return build_from(self.stored, model_class(self.provenance["model"])).eval()
 
-    def data(self, **changed: Any) -> PoseDataModule:
-        """Build the data module of the training.
+    def data(self, **changed: Any) -> PoseDataModule | MultiSceneDataModule:
+        """Build the data module of the training, of one scene or of several.
 
         Arguments of earlier versions that only augmented training images are left out.
 
@@ -63,7 +63,7 @@ class Checkpoint:
         Raises:
             InputError: where the training was given loaders alone.
         """
-        from mambaloc.data import PoseDataModule  # only here: a network is built without the data's libraries
+        from mambaloc.data import build_data  # only here: a network is built without the data's libraries
 
         stored = self.stored.get("datamodule_hyper_parameters", {})
         arguments = {name: value for name, value in stored.items() if not name.startswith("_")}  # Lightning's notes
@@ -71,7 +71,7 @@ class Checkpoint:
             arguments.pop(name, None)
         if not arguments:
             raise InputError(f"{self.path}: holds no data settings; train it with mambaloc train")
-        return PoseDataModule(**{**arguments, **changed})
+        return build_data(**{**arguments, **changed})
 
     @property
     def provenance(self) -> dict[str, Any]:

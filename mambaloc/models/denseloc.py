@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from dataclasses import replace
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mambaloc.data.cameras import assumed_intrinsics
 from mambaloc.errors import InputError
@@ -24,6 +25,7 @@ from mambaloc.nn import (
     PoseNetwork,
     TokenEncoder,
     build_gis,
+    last_layers,
 )
 from mambaloc.types import PosePrediction
 
@@ -51,6 +53,8 @@ class DenseLoc(PoseNetwork):
         position: ``votes`` or ``points``, likewise.
         gis: ``gis``, ``classical`` or ``none``: each cell's, in each branch.
         discretisation: of the state space: ``euler`` or ``zoh``.
+        scenes: how many the network knows; the cells' mean says which one an image shows, and each has outputs of its
+            own.
 
     Shape:
         (B, 3, H, W) in 0..1, intrinsics (B, 3, 3) in pixels -> :class:`~mambaloc.types.PosePrediction`.
@@ -74,8 +78,10 @@ class DenseLoc(PoseNetwork):
         position: CellPosition = "votes",
         gis: GISMode = "none",
         discretisation: Discretisation = "euler",
+        scenes: int = 1,
     ) -> None:
         super().__init__()
+        self.scenes = scenes
         self.backbone, self.image_size, self.is_dense = backbone, image_size, head == "dense"
         self.takes_intrinsics = self.is_dense  # the token's answer has no camera in it
         grids, (*finer, coarsest) = backbone.grids(image_size), backbone.channels
@@ -84,7 +90,9 @@ class DenseLoc(PoseNetwork):
         self.detail = CellDetail(sum(finer), self.grid, dim, feedforward) if finer and self.is_dense else None
         self.position_gis = build_gis(gis, dim, discretisation)
         self.orientation_gis = build_gis(gis, dim, discretisation)
-        self.head = CellHead(dim, rotation, position, head_hidden) if self.is_dense else PoseHead(dim)
+        self.head = CellHead(dim, rotation, position, head_hidden, scenes) if self.is_dense else PoseHead(dim)
+        self.scene_head = nn.Linear(dim, scenes) if scenes > 1 else None
+        self.scene_tables = (*last_layers(self.head, "head"), "head.position_scale.", "scene_head.")
         usual = torch.from_numpy(assumed_intrinsics(image_size[::-1])).float()  # until a training's cameras are known
         self.register_buffer("default_intrinsics", usual)
 
@@ -103,14 +111,21 @@ class DenseLoc(PoseNetwork):
         )
         return position, orientation
 
-    def forward_head(self, branches: tuple[Tensor, Tensor], intrinsics: Tensor | None = None) -> PosePrediction:
+    def forward_head(
+        self, branches: tuple[Tensor, Tensor], intrinsics: Tensor | None = None, scene: Tensor | None = None
+    ) -> PosePrediction:
         """Solve the pose of each image's cells."""
         if not isinstance(self.head, CellHead):
             return self.head(*branches)
         if intrinsics is None:
             intrinsics = self.default_intrinsics.expand(branches[0].shape[0], -1, -1)
         assert self.image_size is not None
-        return self.head(*branches, grid_rays(intrinsics.float(), self.image_size, self.grid), self.grid)
+        rays = grid_rays(intrinsics.float(), self.image_size, self.grid)
+        if self.scene_head is None:
+            return self.head(*branches, rays, self.grid)
+        logits = self.scene_head(branches[0].mean(dim=1))
+        prediction = self.head(*branches, rays, self.grid, logits.argmax(dim=-1) if scene is None else scene)
+        return replace(prediction, scene_logits=logits)
 
 
 @register_model("denseloc")
@@ -122,6 +137,7 @@ class LitDenseLoc(LitPoseRegressor):
     """
 
     network: DenseLoc
+    takes_scenes: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -143,15 +159,18 @@ class LitDenseLoc(LitPoseRegressor):
             raise InputError(f"model.head {head!r}: choose one of {', '.join(get_args(Head))}")
         if head == "token" and loss == "cells":
             loss = "learned_weights"
+        if head == "token" and len(shared.get("scenes") or ()) > 1:
+            raise InputError("model.head 'token': knows one scene. For data.scenes choose dense.")
         super().__init__(backbone=backbone, loss=loss, **shared)
 
     def configure_network(self) -> DenseLoc:
         """Build the network from the hyperparameters."""
         backbone = Backbone(strides=tuple(self.hparams["strides"]), **self.backbone_arguments)
-        return DenseLoc(backbone, self.image_size, **self.hyperparameters_of(DenseLoc))
+        return DenseLoc(backbone, self.image_size, scenes=self.scene_count, **self.hyperparameters_of(DenseLoc))
 
     def setup(self, stage: str) -> None:
         """Take the training cameras' median besides: what an image without intrinsics is taken to be seen by."""
         super().setup(stage)
         if stage == "fit" and (data := getattr(self.trainer, "datamodule", None)) is not None:
-            self.network.default_intrinsics.copy_(data.train_intrinsics.median(dim=0).values)
+            intrinsics = torch.cat([each.train_intrinsics for each in data.each_scene()])
+            self.network.default_intrinsics.copy_(intrinsics.median(dim=0).values)

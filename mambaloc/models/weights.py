@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import inspect
 import pickle
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import lightning as L
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from mambaloc.errors import InputError
+from mambaloc.nn import PoseNetwork
 
 _System = TypeVar("_System", bound=L.LightningModule)
 
@@ -37,25 +39,61 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     return checkpoint
 
 
-def start_from(network: nn.Module, path: str | Path) -> None:
+def start_from(network: PoseNetwork, path: str | Path, scenes: Sequence[str] = ()) -> list[str]:
     """Copy the weights of a checkpoint's network.
+
+    Args:
+        network: which has the weights afterwards.
+        path: of the checkpoint.
+        scenes: names of those that the network learns, where there are several. Of the weights that have rows for each
+            scene it gets those of scenes that the checkpoint's network knows.
+
+    Returns:
+        Names of the scenes that the checkpoint's network knows, in their order.
 
     Raises:
         InputError: where there is no such checkpoint, or its network is another one.
     """
     prefix = "network."
     try:
-        state = read_checkpoint(path)["state_dict"]
+        stored = read_checkpoint(path)
     except InputError as error:
         raise InputError(f"model.warm_start: {error}; train it first, or set it to null") from None
+    known = stored["hyper_parameters"].get("scenes") or [_only_scene(stored)]
+    state = {k.removeprefix(prefix): v for k, v in stored["state_dict"].items() if k.startswith(prefix)}
     try:
-        network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        if network.scenes > 1 and list(scenes) != known:
+            state |= _rows_of_scenes(network, state, known, scenes)
+        network.load_state_dict(state)
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise InputError(
             f"model.warm_start: {path}: its network is another one ({reason}); "
             "train that with this recipe's model arguments"
         ) from None
+    return known
+
+
+def _only_scene(stored: dict[str, Any]) -> str:
+    return str(stored.get("datamodule_hyper_parameters", {}).get("scene", ""))
+
+
+def _rows_of_scenes(
+    network: PoseNetwork, state: dict[str, Tensor], known: list[str], scenes: Sequence[str]
+) -> dict[str, Tensor]:
+    """What a network of other scenes is to have in its tables: rows of known scenes, and its own of new ones."""
+    rows = {}
+    for name, own in network.state_dict().items():
+        if not name.startswith(network.scene_tables):
+            continue
+        table = own.clone().reshape(len(scenes), -1)
+        if name in state:  # that of one scene recognises none
+            other = state[name].reshape(len(known), -1)
+            for index, scene in enumerate(scenes):
+                if scene in known:
+                    table[index] = other[known.index(scene)]
+        rows[name] = table.view_as(own)
+    return rows
 
 
 def build_from(stored: dict[str, Any], cls: type[_System], strict: bool = True, **changed: Any) -> _System:

@@ -5,7 +5,7 @@ from mambaloc.nn.cells import CellDetail, CellHead, CellPosition, CellRotation
 from mambaloc.nn.encoder import TokenEncoder
 from mambaloc.nn.frozen import SplitBackbone
 from mambaloc.nn.gis import GISMode, GlobalInformationSelector, build_gis
-from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation
+from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation, last_layers
 from mambaloc.nn.network import PoseNetwork
 from mambaloc.nn.recomputed import recompute_stages
 from mambaloc.nn.ssm import Discretisation, MambaMixer, selective_scan
@@ -30,6 +30,7 @@ __all__ = [
     "SplitBackbone",
     "TokenEncoder",
     "build_gis",
+    "last_layers",
     "recompute_stages",
     "selective_scan",
 ]

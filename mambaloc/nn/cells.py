@@ -70,10 +70,11 @@ class CellHead(nn.Module):
         rotation: ``procrustes`` or ``quaternion``, the ablation's weighted mean of quaternions.
         position: ``votes`` or ``points``.
         hidden: hidden width of each branch's MLP; None for a linear layer.
+        scenes: how many scenes the network knows; each has outputs and a position scale of its own.
 
     Shape:
-        (B, N, dim), (B, N, dim), (B, N, 3) unit directions of the cells in the camera, and their grid ->
-        :class:`~mambaloc.types.PosePrediction`.
+        (B, N, dim), (B, N, dim), (B, N, 3) unit directions of the cells in the camera, their grid, and with several
+        scenes which one each image is of, (B,) -> :class:`~mambaloc.types.PosePrediction`.
 
     Raises:
         ValueError: for an unknown ``rotation`` or ``position``.
@@ -85,6 +86,7 @@ class CellHead(nn.Module):
         rotation: CellRotation = "procrustes",
         position: CellPosition = "votes",
         hidden: int | None = None,
+        scenes: int = 1,
     ) -> None:
         super().__init__()
         if rotation not in get_args(CellRotation):
@@ -92,18 +94,24 @@ class CellHead(nn.Module):
         if position not in get_args(CellPosition):
             raise ValueError(f"position is 'votes' or 'points', not {position!r}")
         self.is_procrustes, self.sees_points = rotation == "procrustes", position == "points"
-        self.rotation = RegressionHead(dim, hidden, (3 if self.is_procrustes else 4) + 1)
-        self.position = RegressionHead(dim, hidden, 3 + 1)
+        self.rotation = RegressionHead(dim, hidden, scenes * ((3 if self.is_procrustes else 4) + 1))
+        self.position = RegressionHead(dim, hidden, scenes * (3 + 1))
         if self.sees_points:
-            self.points = RegressionHead(dim, hidden, 3 + 1)
-        self.position_scale = PositionScale()
+            self.points = RegressionHead(dim, hidden, scenes * (3 + 1))
+        self.position_scale = PositionScale(scenes)
+        self.scenes = scenes
 
     def forward(
-        self, position_BND: Tensor, rotation_BND: Tensor, rays_cam: Tensor, grid: tuple[int, int]
+        self,
+        position_BND: Tensor,
+        rotation_BND: Tensor,
+        rays_cam: Tensor,
+        grid: tuple[int, int],
+        scene: Tensor | None = None,
     ) -> PosePrediction:
         """Solve the pose, in float32 even under autocast."""
-        rotation, rotation_weights = _said(self.rotation(rotation_BND))
-        votes, position_weights = _said(self.position(position_BND))
+        rotation, rotation_weights = self._answers(self.rotation(rotation_BND), scene)
+        votes, position_weights = self._answers(self.position(position_BND), scene)
         rays_world = None
         if self.is_procrustes:
             rays_world = F.normalize(rotation, dim=-1)
@@ -112,23 +120,27 @@ class CellHead(nn.Module):
             quaternion = canonical((rotation_weights[..., None] * canonical(rotation)).sum(dim=1))
         position, points = (position_weights[..., None] * votes).sum(dim=1), None
         if self.sees_points:
-            points, position_weights = _said(self.points(position_BND))
+            points, position_weights = self._answers(self.points(position_BND), scene)
             directions = rotate(quaternion[:, None], rays_cam)
             position = intersect_rays(directions, points, position_weights, position, _VOTES_WEIGHT)
         metres = self.position_scale
         cells = CellPrediction(
             rays_cam,
             rays_world,
-            metres(votes),
-            None if points is None else metres(points),
+            metres(votes, scene),
+            None if points is None else metres(points, scene),
             rotation_weights,
             position_weights,
             grid,
         )
-        return PosePrediction(metres(position), quaternion, cells=cells)
+        return PosePrediction(metres(position, scene), quaternion, cells=cells)
 
-
-def _said(outputs_BNO: Tensor) -> tuple[Tensor, Tensor]:
-    """Split what cells say into values, (B, N, O - 1), and weights that sum to 1, (B, N)."""
-    values, logits = outputs_BNO[..., :-1], outputs_BNO[..., -1]
-    return values, torch.softmax(logits, dim=-1)
+    def _answers(self, outputs_BNO: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Split the outputs of each image's scene into values, (B, N, O - 1), and weights that sum to 1, (B, N)."""
+        if scene is not None:
+            each_BNSO = outputs_BNO.unflatten(-1, (self.scenes, -1))
+            _, cells, _, outputs = each_BNSO.shape
+            row = scene.view(-1, 1, 1, 1).expand(-1, cells, 1, outputs)
+            outputs_BNO = each_BNSO.gather(2, row).squeeze(2)
+        values, logits = outputs_BNO[..., :-1], outputs_BNO[..., -1]
+        return values, torch.softmax(logits, dim=-1)

@@ -31,6 +31,12 @@ class PoseNetwork(nn.Module):
 
     backbone: ImageBackbone
     head: PoseHead | CellHead
+    scenes: int = 1
+    """How many scenes the network knows. With several it recognises each image's, and its pose is in that one's frame."""
+
+    scene_tables: tuple[str, ...] = ()
+    """Beginnings of the names of those weights that have as many rows for each scene, in their order."""
+
     image_size: tuple[int, int] | None = None
     """(height, width) that the network was built for; None takes any."""
 
@@ -56,19 +62,24 @@ class PoseNetwork(nn.Module):
         """Turn images, (B, 3, H, W) in 0..1, into both branches' features, as :meth:`features`."""
         return self.features(self.forward_backbone(image))
 
-    def forward_head(self, branches: tuple[Tensor, Tensor], intrinsics: Tensor | None = None) -> PosePrediction:
+    def forward_head(
+        self, branches: tuple[Tensor, Tensor], intrinsics: Tensor | None = None, scene: Tensor | None = None
+    ) -> PosePrediction:
         """Turn both branches' features into poses."""
         return self.head(*branches)
 
-    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> PosePrediction:
+    def forward(
+        self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None
+    ) -> PosePrediction:
         """Localise images.
 
         Args:
             image: (B, 3, H, W) in 0..1.
             intrinsics: (B, 3, 3) in pixels of ``image``; where the network takes them, the training camera's unless
                 given.
+            scene: (B,), in whose frame each pose is to be, of a network that knows several; the likeliest unless given.
 
         Raises:
             ValueError: as :meth:`forward_backbone`.
         """
-        return self.forward_head(self.forward_features(image), intrinsics)
+        return self.forward_head(self.forward_features(image), intrinsics, scene)

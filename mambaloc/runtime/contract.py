@@ -33,6 +33,9 @@ MODEL_FILES = {"onnx": "model.onnx", "fp16": "model.fp16.onnx", "int8": "model.i
 UNCERTAINTY = ("position_radius_m", "rotation_radius_deg", "unfamiliarity")
 """Outputs of a model that tells how sure it is."""
 
+SCENE_PROBABILITY = "scene_probability"
+"""Output of a model that knows several scenes: how likely the image shows each, (batch, scenes), of sum 1."""
+
 POSE = (
     "world_from_cam: camera centre in metres, unit quaternion wxyz with w >= 0; "
     "OpenCV camera axes (x right, y down, z forward)"
@@ -74,6 +77,19 @@ class Preprocessing:
 
 
 @dataclass(frozen=True)
+class SceneFrame:
+    """One of several scenes that a model knows.
+
+    Args:
+        name: of the scene.
+        world: where its frame lies in that of the data it was made of.
+    """
+
+    name: str
+    world: World = field(default_factory=World)
+
+
+@dataclass(frozen=True)
 class Contract:
     """The contract of one model; written into the ONNX file's metadata and into a bundle's ``contract.json``.
 
@@ -89,6 +105,7 @@ class Contract:
         pose: frame, units and order of its outputs.
         world: where the scene's frame lies in that of the data it was made of.
         undistortion: how the training pictures were made of what their camera stored.
+        scenes: of a model that knows several, in the order of its probabilities; a pose is in the likeliest one's frame.
     """
 
     model: str
@@ -101,12 +118,17 @@ class Contract:
     pose: str = POSE
     world: World = field(default_factory=World)
     undistortion: Undistortion = field(default_factory=Undistortion)
+    scenes: tuple[SceneFrame, ...] = ()
 
     @property
     def outputs(self) -> dict[str, list[str | int]]:
         """Names and shapes of what the model says of an image, in their order."""
-        pose: dict[str, list[str | int]] = {"position_m": ["batch", 3], "quaternion_wxyz": ["batch", 4]}
-        return pose if self.uncertainty is None else pose | {name: ["batch"] for name in UNCERTAINTY}
+        outputs: dict[str, list[str | int]] = {"position_m": ["batch", 3], "quaternion_wxyz": ["batch", 4]}
+        if self.uncertainty is not None:
+            outputs |= {name: ["batch"] for name in UNCERTAINTY}
+        if self.scenes:
+            outputs[SCENE_PROBABILITY] = ["batch", len(self.scenes)]
+        return outputs
 
     def preprocessing_for(self, size: tuple[int, int], intrinsics: ArrayLike) -> Preprocessing:
         """Resizing that shows things as large as the training camera does; the crop may then be black at its border.
@@ -175,6 +197,9 @@ class Contract:
                 str(data["pose"]),
                 World.from_json(data.get("world")),
                 Undistortion.from_json(data.get("undistortion")),
+                tuple(
+                    SceneFrame(str(each["name"]), World.from_json(each["world"])) for each in data.get("scenes") or ()
+                ),
             )
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             reason = f"{type(error).__name__}: {error}"

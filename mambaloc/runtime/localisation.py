@@ -44,6 +44,9 @@ class Localisation:
             the fixed axes of the world, as ROS's PoseWithCovariance has it. None otherwise.
         focal_scale: how many times the given focal length the map's matches ask for; None where they do not contradict
             it, and where there is no map.
+        scene: name of the scene that the image shows, in whose frame the pose is, where the network knows several. An
+            unfamiliar image shows none of them.
+        scene_probability: of that scene, against the others.
     """
 
     position_m: Floats
@@ -56,6 +59,8 @@ class Localisation:
     inliers: int | None = None
     covariance: Floats | None = None
     focal_scale: float | None = None
+    scene: str | None = None
+    scene_probability: float | None = None
 
     @property
     def is_accepted(self) -> bool:

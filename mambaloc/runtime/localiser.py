@@ -69,6 +69,10 @@ class Localiser:
         """Where the scene's frame lies in the world that answers are in: that of the data it was made of."""
         return self._place.world
 
+    def _world_of(self, scene: str | None) -> World:
+        scenes = self.contract.scenes if self.contract else ()
+        return next((each.world for each in scenes if each.name == scene), self.world)
+
     @property
     def undistortion(self) -> Undistortion:
         """How the training pictures were made of what their camera stored: as the network has it, or else the map."""
@@ -113,7 +117,7 @@ class Localiser:
             _warn_of_focal_length(in_map)
         answer = network if in_map is None else combined(network, in_map)
         assert answer is not None  # one of the two is there
-        position_m = self.world.position_m(answer.position_m)
+        position_m = self._world_of(answer.scene).position_m(answer.position_m)
         return replace(answer, position_m=position_m, latency_s=time.perf_counter() - start)
 
     def localise_each(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.images import Image
-from mambaloc.runtime.contract import INTRINSICS_INPUT, METADATA_KEY, Contract
+from mambaloc.runtime.contract import INTRINSICS_INPUT, METADATA_KEY, SCENE_PROBABILITY, UNCERTAINTY, Contract
 from mambaloc.runtime.localisation import Localisation
 from mambaloc.runtime.maps.features import check_intrinsics
 
@@ -59,9 +60,17 @@ class Network:
         """
         start = time.perf_counter()
         said = self._session.run(None, self._feeds(rgb, None if self.contract.intrinsics is None else intrinsics))
-        taken_s, (position_m, quaternion, *uncertainty) = time.perf_counter() - start, (each[0] for each in said)
-        radius_m, radius_deg, unfamiliarity = map(float, uncertainty) if uncertainty else (None, None, None)
-        return Localisation(position_m, quaternion, taken_s, radius_m, radius_deg, unfamiliarity)
+        taken_s, found = time.perf_counter() - start, dict(zip(self.contract.outputs, (each[0] for each in said), strict=True))
+        stated = {name: float(found[name]) for name in UNCERTAINTY if name in found}
+        answer = Localisation(found["position_m"], found["quaternion_wxyz"], taken_s, **stated)
+        if not self.contract.scenes:
+            return answer
+        likeliest = int(found[SCENE_PROBABILITY].argmax())
+        return replace(
+            answer,
+            scene=self.contract.scenes[likeliest].name,
+            scene_probability=float(found[SCENE_PROBABILITY][likeliest]),
+        )
 
     def _check_input(self) -> None:
         """The metadata and the graph may come from two hands."""
