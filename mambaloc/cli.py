@@ -190,7 +190,9 @@ class RecipeCLI(LightningCLI):
         if isinstance(data := found[0].data(), MultiSceneDataModule):
             figure = str(Path(figure).parent)
             for each in found:
-                print_scenes(evaluate_scenes(each, run_dir / "evaluation" / each.path.stem, data, with_retrieval=retrieval))
+                print_scenes(
+                    evaluate_scenes(each, run_dir / "evaluation" / each.path.stem, data, with_retrieval=retrieval)
+                )
         else:
             beside = measure_map_of_run(run_dir, data)
             results = [

@@ -252,7 +252,9 @@ class PoseDataModule(L.LightningDataModule):
 
     def _of_scene(self, batch: PoseBatch) -> PoseBatch:
         """Say which scene the images show, where it is one of several."""
-        return batch if self.scene_index is None else replace(batch, scene=torch.full_like(batch.index, self.scene_index))
+        return (
+            batch if self.scene_index is None else replace(batch, scene=torch.full_like(batch.index, self.scene_index))
+        )
 
     def augmented(self, batch: PoseBatch, epoch: int) -> PoseBatch:
         """View and colour training images as chance has it, which depends on (seed, epoch, row) alone."""

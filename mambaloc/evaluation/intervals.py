@@ -69,5 +69,6 @@ def difference_interval(
 
 
 def _middle(values: NDArray[np.floating], level: float) -> tuple[float, float]:
-    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
+    with np.errstate(invalid="ignore"):  # between two infinite medians, of frames without a pose
+        low, high = np.nan_to_num(np.quantile(values, [(1 - level) / 2, (1 + level) / 2]), nan=np.inf, posinf=np.inf)
     return float(low), float(high)

@@ -104,7 +104,9 @@ def write_bundle(
             _write_trajectory(scenes[0], partial)
         size_m = max(1.0, float(system.network.head.position_scale.scale_m.max()))
         models = [MODEL_FILES[name] for name in written]
-        write_pages(partial, contract, scenes[0].hparams["dataset"], models, target, None if in_map is None else in_map.map)
+        write_pages(
+            partial, contract, scenes[0].hparams["dataset"], models, target, None if in_map is None else in_map.map
+        )
         described = {} if in_map is None else {"map": describe_map(in_map.map)}
         _write_contract(partial, contract, frames, written, size_m, int8, described)
         deviations = verify_bundle(partial)

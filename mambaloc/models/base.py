@@ -61,8 +61,9 @@ class LitPoseRegressor(L.LightningModule):
         scenes: names of the scenes that one network learns, where there are several; recipes set them once, in ``data``.
         warm_start: checkpoint of a like network, whose weights the training starts from. Where that knows other scenes,
             those that both know keep their outputs.
-        new_scenes_only: train nothing but the outputs of scenes that ``warm_start`` does not know. The others are then
-            localised as before, frames of all take part, and recognition learns the new ones.
+        new_scenes_only: train nothing but the outputs of scenes that ``warm_start`` does not know, on frames of all.
+            ``denseloc`` then answers in the others as before; queries of ``multi_scene_transposenet`` attend to one
+            another, so that new ones change the others' answers.
         loss: name in ``mambaloc.losses.LOSSES``.
         loss_args: that loss's arguments.
         compile_mode: run training steps through ``torch.compile`` in this mode: ``default``, or ``reduce-overhead``,
@@ -139,7 +140,9 @@ class LitPoseRegressor(L.LightningModule):
         self.scene_count = max(1, len(scenes or ()))
         if self.scene_count > 1 and not self.takes_scenes:
             name = getattr(self, "registry_name", type(self).__name__)
-            raise InputError(f"model: {name} knows one scene. For data.scenes choose denseloc or multi_scene_transposenet.")
+            raise InputError(
+                f"model: {name} knows one scene. For data.scenes choose denseloc or multi_scene_transposenet."
+            )
         self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode
         self._compiled: Callable[..., PosePrediction] | None = None
         self._split: tuple[SplitBackbone, FeatureCache] | None = None
@@ -147,10 +150,12 @@ class LitPoseRegressor(L.LightningModule):
         self.provenance: dict[str, Any] = {}
         self.save_hyperparameters()
         self.network = self.configure_network()
+        self._new_scenes = list(range(self.scene_count))
         if warm_start is not None:
             known = start_from(self.network, warm_start, scenes or [])
             if new_scenes_only:
-                self._train_only([index for index, name in enumerate(scenes or []) if name not in known])
+                self._new_scenes = [index for index, name in enumerate(scenes or []) if name not in known]
+                self._train_new_scenes_only()
         elif new_scenes_only:
             raise InputError("model.new_scenes_only: needs model.warm_start, a checkpoint that knows the other scenes.")
         if frozen_groups:
@@ -160,17 +165,19 @@ class LitPoseRegressor(L.LightningModule):
         if recomputed_stages:
             recompute_stages(self.network.backbone.model, self.network.backbone.name, recomputed_stages)
 
-    def _train_only(self, new: list[int]) -> None:
+    def _train_new_scenes_only(self) -> None:
         """Freeze all but the rows of new scenes, whose gradients alone are kept."""
-        if not new:
-            raise InputError("model.new_scenes_only: the checkpoint of warm_start knows all scenes. Add one to data.scenes.")
+        if not self._new_scenes:
+            raise InputError(
+                "model.new_scenes_only: the checkpoint of warm_start knows all scenes. Add one to data.scenes."
+            )
         self.network.requires_grad_(False)
         self.network.backbone.freeze_statistics()
         self.weight_decay = 0.0  # it would shrink the others' rows
         for name, parameter in self.network.named_parameters():
             if name.startswith(self.network.scene_tables):
                 is_new = torch.zeros(self.scene_count, 1)
-                is_new[new] = 1
+                is_new[self._new_scenes] = 1
                 parameter.requires_grad_(True).register_hook(partial(_gradient_of_rows, is_new))
 
     def configure_network(self) -> PoseNetwork:
@@ -187,9 +194,7 @@ class LitPoseRegressor(L.LightningModule):
         taken = set(inspect.signature(network).parameters) - {"backbone", "image_size", "scenes"}
         return {name: value for name, value in self.hparams.items() if name in taken}
 
-    def forward(
-        self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None
-    ) -> PosePrediction:
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None) -> PosePrediction:
         """Localise images, (B, 3, H, W) in 0..1, of cameras (B, 3, 3) in pixels of them, in given scenes (B,)."""
         return self.network(image, intrinsics, scene)
 
@@ -209,8 +214,9 @@ class LitPoseRegressor(L.LightningModule):
         if stage == "fit" and self.normalise_position:
             for module in self.network.modules():
                 if isinstance(module, PositionScale):
-                    for index, each in enumerate(self.scene_for("normalise_position").each_scene()):
-                        module.fit(each.train_position_m, index)
+                    scenes = self.scene_for("normalise_position").each_scene()
+                    for index in self._new_scenes:
+                        module.fit(scenes[index].train_position_m, index)
         if stage == "fit" and self.compile_mode is not None:
             accumulated = self.trainer.accumulate_grad_batches
             self._compiled = compile_forward(self.network, self.compile_mode, accumulated)

@@ -117,9 +117,7 @@ class GoogLeNetPoseNet(PoseNet):
         super().__init__(backbone, **kwargs)
         self.auxiliary_heads = nn.ModuleList(PoseHead(backbone.width) for _ in range(2))
 
-    def forward(
-        self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None
-    ) -> PosePrediction:
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None) -> PosePrediction:
         """Localise images."""
         if not self.training:
             return super().forward(image)

@@ -94,9 +94,7 @@ class PoseHead(nn.Module):
         :class:`~mambaloc.types.PosePrediction`.
     """
 
-    def __init__(
-        self, dim: int, rotation: Rotation = "quaternion", hidden: int | None = None, scenes: int = 1
-    ) -> None:
+    def __init__(self, dim: int, rotation: Rotation = "quaternion", hidden: int | None = None, scenes: int = 1) -> None:
         super().__init__()
         if rotation not in get_args(Rotation):
             raise ValueError(f"rotation is 'quaternion' or 'log_quaternion', not {rotation!r}")

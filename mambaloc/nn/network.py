@@ -68,9 +68,7 @@ class PoseNetwork(nn.Module):
         """Turn both branches' features into poses."""
         return self.head(*branches)
 
-    def forward(
-        self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None
-    ) -> PosePrediction:
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None) -> PosePrediction:
         """Localise images.
 
         Args:

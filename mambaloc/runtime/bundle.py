@@ -102,8 +102,10 @@ def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None
     """Let a model localise its bundle's frames: largest deviation in mm and degrees, and median latency in ms."""
     localiser = Localiser(model, threads)
     found = [(localiser.localise(model.parent / frame["file"], frame.get("intrinsics")), frame) for frame in frames]
-    offset_m = np.array(localiser.world.offset_m)  # frames are told in the scene's frame, as the models say them
-    return _compared([(replace(pose, position_m=pose.position_m - offset_m), frame) for pose, frame in found])
+    in_scene = [  # frames are told in their scene's frame, as the models say them
+        (replace(pose, position_m=pose.position_m - localiser.world_of(pose).offset_m), frame) for pose, frame in found
+    ]
+    return _compared(in_scene)
 
 
 def replay_map(folder: Path, frames: list[dict[str, Any]]) -> Replay:

@@ -69,9 +69,10 @@ class Localiser:
         """Where the scene's frame lies in the world that answers are in: that of the data it was made of."""
         return self._place.world
 
-    def _world_of(self, scene: str | None) -> World:
+    def world_of(self, answer: Localisation) -> World:
+        """Where the frame of an answer's scene lies, of a network that knows several; :attr:`world` of others."""
         scenes = self.contract.scenes if self.contract else ()
-        return next((each.world for each in scenes if each.name == scene), self.world)
+        return next((each.world for each in scenes if each.name == answer.scene), self.world)
 
     @property
     def undistortion(self) -> Undistortion:
@@ -117,7 +118,7 @@ class Localiser:
             _warn_of_focal_length(in_map)
         answer = network if in_map is None else combined(network, in_map)
         assert answer is not None  # one of the two is there
-        position_m = self._world_of(answer.scene).position_m(answer.position_m)
+        position_m = self.world_of(answer).position_m(answer.position_m)
         return replace(answer, position_m=position_m, latency_s=time.perf_counter() - start)
 
     def localise_each(

@@ -60,7 +60,10 @@ class Network:
         """
         start = time.perf_counter()
         said = self._session.run(None, self._feeds(rgb, None if self.contract.intrinsics is None else intrinsics))
-        taken_s, found = time.perf_counter() - start, dict(zip(self.contract.outputs, (each[0] for each in said), strict=True))
+        taken_s, found = (
+            time.perf_counter() - start,
+            dict(zip(self.contract.outputs, (each[0] for each in said), strict=True)),
+        )
         stated = {name: float(found[name]) for name in UNCERTAINTY if name in found}
         answer = Localisation(found["position_m"], found["quaternion_wxyz"], taken_s, **stated)
         if not self.contract.scenes:
