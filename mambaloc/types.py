@@ -110,8 +110,8 @@ class PosePrediction:
         ``log_quaternion`` (B, 3): what a system that regresses it said; ``quaternion`` is its exponential.
         ``auxiliary``: what auxiliary heads say while training.
         ``cells``: what a dense head's cells say, out of which it solves the pose.
-        ``scene_logits`` (B, S): of a network that knows several scenes, how each fits the image. The pose is in the frame
-        of the scene that it was asked for, or else of the likeliest one.
+        ``scene_logits`` (B, S): of a network that knows several scenes, how each fits the image. The pose is in the
+        frame of the scene that it was asked for, or else of the likeliest one.
     """
 
     position_m: Tensor

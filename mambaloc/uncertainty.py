@@ -138,7 +138,8 @@ class UncertaintyHead(nn.Module):
 def fit_uncertainty(system: LitPoseRegressor, data: PoseDataModule | MultiSceneDataModule) -> UncertaintyHead:
     """Measure how a system's errors grow with the distance to the training images, on its validation frames.
 
-    Of several scenes, images are compared with those of all: one that is unfamiliar shows none of them. Where the best epoch was chosen on them, they flatter it a little.
+    Where the best epoch was chosen on them, they flatter it a little. Of several scenes, images are compared with
+    those of all: one that is unfamiliar shows none of them.
 
     Args:
         system: trained; left as it was.

@@ -10,9 +10,9 @@ from mambaloc.viz.views import draw_views
 
 
 class ViewSheet(L.Callback):
-    """Draw synthetic views beside real frames to ``RUN/views.png``, where there are views; of several scenes, a file each.
+    """Draw synthetic views beside real frames to ``RUN/views.png``, where there are views.
 
-    Views that were found not worth training on are drawn, too: the sheet shows why.
+    Views that were found not worth training on are drawn, too: the sheet shows why. Of several scenes each has a sheet.
 
     Args:
         enabled: whether to.

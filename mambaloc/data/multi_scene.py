@@ -26,7 +26,7 @@ class MultiSceneDataModule(L.LightningDataModule):
     """Several scenes for one network; every training batch has images of each.
 
     Each scene keeps what it has alone: its frame of reference, its split, its views and its cameras. It is a
-    :class:`PoseDataModule`, of which :meth:`each_scene` gives them all; whoever measures or deploys goes scene by scene.
+    :class:`PoseDataModule`, and :meth:`each_scene` gives them all: what measures or deploys goes scene by scene.
 
     Args:
         scenes: names of scenes of ``dataset``, ``DATASET/NAME`` of another one, or paths of imported scenes.

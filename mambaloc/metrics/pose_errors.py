@@ -68,8 +68,7 @@ class PoseErrorTable:
 class PoseErrors(Metric):
     """Collect every frame's prediction; correct under DDP, where a median of medians would not be.
 
-    Frames that a distributed sampler repeats are counted once. A pose in another scene's frame is no pose: its errors are
-    infinite.
+    Frames that a distributed sampler repeats are counted once. Errors of a pose in another scene's frame are infinite.
     """
 
     full_state_update = False

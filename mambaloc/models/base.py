@@ -58,7 +58,7 @@ class LitPoseRegressor(L.LightningModule):
         pixel_std: RGB deviation, likewise.
         gis: the Global Information Selector of each branch: ``gis``, its ablation ``classical``, or ``none``.
         discretisation: of GIS's state space: ``euler`` or ``zoh``.
-        scenes: names of the scenes that one network learns, where there are several; recipes set them once, in ``data``.
+        scenes: names of the scenes that one network learns, where there are several; recipes set them in ``data``.
         warm_start: checkpoint of a like network, whose weights the training starts from. Where that knows other scenes,
             those that both know keep their outputs.
         new_scenes_only: train nothing but the outputs of scenes that ``warm_start`` does not know, on frames of all.

@@ -20,8 +20,8 @@ from mambaloc.types import PosePrediction
 class MultiSceneTransPoseNet(PoseNetwork):
     """TransPoseNet's two encoders, and decoders in which one query a scene asks what the image shows of it.
 
-    A linear layer on what both decoders answer each query says which scene it is; the heads, which all scenes share, read
-    the answers of that one.
+    A linear layer on what both decoders answer each query says which scene it is; the heads, which all scenes share,
+    read the answers of that one.
 
     Args:
         backbone: feature maps at strides 8 and 16.

@@ -32,7 +32,7 @@ class PoseNetwork(nn.Module):
     backbone: ImageBackbone
     head: PoseHead | CellHead
     scenes: int = 1
-    """How many scenes the network knows. With several it recognises each image's, and its pose is in that one's frame."""
+    """How many scenes the network knows. With several it recognises each image's; the pose is in that one's frame."""
 
     scene_tables: tuple[str, ...] = ()
     """Beginnings of the names of those weights that have as many rows for each scene, in their order."""

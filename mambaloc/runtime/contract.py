@@ -105,7 +105,7 @@ class Contract:
         pose: frame, units and order of its outputs.
         world: where the scene's frame lies in that of the data it was made of.
         undistortion: how the training pictures were made of what their camera stored.
-        scenes: of a model that knows several, in the order of its probabilities; a pose is in the likeliest one's frame.
+        scenes: of a model that knows several, in the order of its probabilities; poses are in the likeliest's frame.
     """
 
     model: str

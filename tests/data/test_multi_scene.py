@@ -1,7 +1,7 @@
 """Several scenes in one data module: every batch has images of each, as the scene alone gives them.
 
-Guess first: that Lightning's CombinedLoader tells its length before it is iterated (wrong: it raises, so the data module
-counts an epoch's batches itself), and that it gives each part's sampler the epoch (right).
+Guess first: that Lightning's CombinedLoader tells its length before it is iterated (wrong: it raises, so the data
+module counts an epoch's batches itself), and that it gives each part's sampler the epoch (right).
 """
 
 import shutil

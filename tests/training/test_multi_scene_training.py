@@ -108,10 +108,8 @@ def test_the_exported_model_says_the_scene_and_the_pose_in_its_world(run, two_sc
 
 def test_its_radii_are_of_frames_of_both_scenes(run):
     contract = Localiser(run / "model.onnx").contract
-    held_out = sum(
-        each["val_frames"]
-        for each in Checkpoint.read(run / "checkpoints/best.ckpt").provenance["data"]["scenes"].values()
-    )
+    told = Checkpoint.read(run / "checkpoints/best.ckpt").provenance["data"]["scenes"]
+    held_out = sum(each["val_frames"] for each in told.values())
     assert 0 < contract.uncertainty["held_out_frames"] <= held_out
 
 
