@@ -64,8 +64,10 @@ class Network:
             time.perf_counter() - start,
             dict(zip(self.contract.outputs, (each[0] for each in said), strict=True)),
         )
-        stated = {name: float(found[name]) for name in UNCERTAINTY if name in found}
-        answer = Localisation(found["position_m"], found["quaternion_wxyz"], taken_s, **stated)
+        radius_m, radius_deg, unfamiliarity = (float(found[name]) if name in found else None for name in UNCERTAINTY)
+        answer = Localisation(
+            found["position_m"], found["quaternion_wxyz"], taken_s, radius_m, radius_deg, unfamiliarity
+        )
         if not self.contract.scenes:
             return answer
         likeliest = int(found[SCENE_PROBABILITY].argmax())

@@ -28,7 +28,7 @@ OVERLAYS = sorted({*BLOCKS.parent.glob("*.yaml")} - {BLOCKS, BLOCKS.with_name("g
 
 SYSTEMS = {system.__name__: system for system in (LitDistillation, *map(model_class, list_models()))}
 NARROW = {
-    "dim": 16, "encoder_layers": 1, "heads": 2, "feedforward": 16, "head_hidden": 16, "width": 64, "hidden": 16,
+    "dim": 16, "encoder_layers": 1, "decoder_layers": 1, "heads": 2, "feedforward": 16, "head_hidden": 16, "width": 64, "hidden": 16,
     "stage_channels": 64, "blocks": 2, "groups": 4,
 }  # fmt: skip
 
@@ -75,9 +75,13 @@ def stand_in(recipe: Path, scenes: Path, cambridge: Path, teacher: Path) -> list
     options += ["--model.teacher", str(teacher)] if "teacher" in model["init_args"] else []
     options += ["--data.image_size", "48", "--data.short_side", "48", "--data.batch_size", "2"]
     options += ["--data.validation", "sequences", "--data.val_sequences", "null", "--trainer.fast_dev_run", "1"]
+    dataset, root, scene = ("7scenes", scenes, "heads")
     if data["dataset"] == "cambridge":
-        return [*options, "--data.root", str(cambridge), "--data.scene", "KingsCollege"]
-    return [*options, "--data.dataset", "7scenes", "--data.root", str(scenes), "--data.scene", "heads"]
+        dataset, root, scene = ("cambridge", cambridge, "KingsCollege")
+    place = ["--data.dataset", dataset, "--data.root", str(root)]
+    if "scenes" in data:  # the same one, by its name and by its path
+        return [*options, *place, "--data.scenes", f"[{scene},{root / scene}]"]
+    return [*options, *place, "--data.scene", scene]
 
 
 def narrow(recipe: Path) -> list[str]:

@@ -34,7 +34,8 @@ export class Network {
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels, which a model that takes none leaves unread; the
    *   training camera's unless given.
    * @returns `world_from_cam`: the camera centre in metres, a unit quaternion wxyz, and what it took; where the model
-   *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for a picture of elsewhere.
+   *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for a picture of elsewhere; where
+   *   it knows several scenes, the likeliest one's name, probability, and offset in its world, in whose frame the pose is.
    */
   async localise(image, intrinsics = null) {
     const start = performance.now();
@@ -48,7 +49,15 @@ export class Network {
     }
     const told = UNCERTAINTY.filter((name) => name in found).map((name) => [name, Number(found[name].data[0])]);
     const took = { preprocess_ms: fed - start, network_ms: performance.now() - fed };
-    return { position_m, quaternion_wxyz, ...Object.fromEntries(told), ...took };
+    return { position_m, quaternion_wxyz, ...Object.fromEntries(told), ...this.#scene(found), ...took };
+  }
+
+  #scene({ scene_probability }) {
+    if (!scene_probability) return {};
+    const probabilities = Array.from(scene_probability.data.slice(0, this.#contract.scenes.length), Number);
+    const likeliest = probabilities.indexOf(Math.max(...probabilities));
+    const { name, world } = this.#contract.scenes[likeliest];
+    return { scene: name, scene_probability: probabilities[likeliest], offset_m: world.offset_m };
   }
 
   #feeds(image, { preprocessing, camera }) {

@@ -55,8 +55,8 @@ export class Readout {
    * @param {string} file of a test frame, or "".
    */
   show(pose, source, file = "") {
-    const { quaternion_wxyz } = pose;
-    const position_m = pose.position_m.map((value, axis) => value + this.offset[axis]);
+    const { quaternion_wxyz, offset_m = this.offset } = pose;
+    const position_m = pose.position_m.map((value, axis) => value + offset_m[axis]);
     const data = this.#element.dataset;
     data.positionM = JSON.stringify(position_m);
     data.quaternionWxyz = JSON.stringify(quaternion_wxyz);
@@ -74,14 +74,15 @@ export class Readout {
     data.frame = String((this.#count += 1)); // last: who waits for it finds the rest in place
   }
 
-  /** Say which of network and map answers, and how many matches agree. */
-  #showAnswer({ source, map }) {
+  /** Say which of network and map answers, and how many matches agree; or which of several scenes it is. */
+  #showAnswer({ source, map, scene, scene_probability }) {
     const row = document.getElementById("answer");
-    row.hidden = map === undefined;
-    Object.assign(this.#element.dataset, { answer: source, inliers: map?.inliers ?? 0 });
-    shown("answer").textContent = source;
+    row.hidden = map === undefined && scene === undefined;
+    Object.assign(this.#element.dataset, { answer: source, inliers: map?.inliers ?? 0, scene: scene ?? "" });
+    shown("answer").textContent = scene ?? source;
     const agree = map && `${map.inliers} of ${map.matches.length} matches agree`;
-    shown("answer-detail").textContent = agree || "no pose in the map";
+    const likely = scene && `${(100 * scene_probability).toFixed(0)} % likely`;
+    shown("answer-detail").textContent = likely || agree || "no pose in the map";
     row.querySelector(".scale").hidden = source !== "map";
   }
 
