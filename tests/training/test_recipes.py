@@ -28,8 +28,8 @@ OVERLAYS = sorted({*BLOCKS.parent.glob("*.yaml")} - {BLOCKS, BLOCKS.with_name("g
 
 SYSTEMS = {system.__name__: system for system in (LitDistillation, *map(model_class, list_models()))}
 NARROW = {
-    "dim": 16, "encoder_layers": 1, "decoder_layers": 1, "heads": 2, "feedforward": 16, "head_hidden": 16, "width": 64, "hidden": 16,
-    "stage_channels": 64, "blocks": 2, "groups": 4,
+    "dim": 16, "encoder_layers": 1, "decoder_layers": 1, "heads": 2, "feedforward": 16, "head_hidden": 16, "width": 64,
+    "hidden": 16, "stage_channels": 64, "blocks": 2, "groups": 4,
 }  # fmt: skip
 
 
