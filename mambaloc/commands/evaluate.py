@@ -28,6 +28,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--map", type=Path, metavar="FILE", help="measure it beside the network; the run's unless given"
     )
+    parser.add_argument(
+        "--rerun", type=Path, metavar="FILE.rrd", help="also record frames and poses for Rerun's viewer"
+    )
     parser.add_class_arguments(PoseDataModule, "data")
     path = parser.parse_args(argv, defaults=False).checkpoint
     if path is None:
@@ -39,6 +42,9 @@ def main(argv: list[str] | None = None) -> None:
     out = args.out or run / "evaluation" / path.stem
     data = PoseDataModule(**args.data)
     beside = measure_map(args.map, data) if args.map else measure_map_of_run(run, data)
-    print_table([evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval, beside)])
+    measured = evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval, beside, args.rerun)
+    print_table([measured])
     both = ", predictions_both.csv, predictions_both.tum" if beside else ""
     print(f"{out}: metrics.json, predictions.csv, predictions.tum{both}, trajectory.png")
+    if args.rerun is not None:
+        print(f"{args.rerun}: open it with rerun {args.rerun}")

@@ -48,11 +48,13 @@ class Task:
         bundle: name of the bundle.
         picture: an encoded picture: JPEG, PNG and what else :func:`~mambaloc.images.decode_image` takes.
         intrinsics: (3, 3) pinhole matrix in its pixels; the training camera's unless given.
+        is_distorted: it is as the training camera stores it, and is undistorted by its lens.
     """
 
     bundle: str
     picture: bytes
     intrinsics: tuple[tuple[float, ...], ...] | None = None
+    is_distorted: bool = False
 
 
 class WorkerLostError(Exception):
@@ -220,7 +222,7 @@ def _answer(localiser: Localiser, task: Task) -> Answer:
         return {"error": image}
     with warnings.catch_warnings(record=True) as told:
         try:
-            found = localiser.localise(image, task.intrinsics)
+            found = localiser.localise(image, task.intrinsics, task.is_distorted)
         except InputError as error:
             return {"error": str(error)}
     answer = {"bundle": task.bundle, "scene": localiser.scene, **pose_of(found)}
