@@ -53,8 +53,9 @@ def read_new_frames(
             raise InputError(f"{source}: a scene's pictures have no distortion. Leave out --distorted.")
         return list(_posed(source, localiser))
     frames = list(_unposed(source, localiser, intrinsics, is_distorted))
-    if intrinsics is None and not is_distorted:
-        _check_focal_length(source, localiser, frames)
+    if intrinsics is None:
+        remedy = "Give them without distortion, and their camera" if is_distorted else "Give their camera"
+        _check_focal_length(source, localiser, frames, remedy)
     return frames
 
 
@@ -83,7 +84,7 @@ def _unposed(
         yield NewFrame(frame.name, localiser.features(image, matrix))
 
 
-def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[NewFrame]) -> None:
+def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[NewFrame], remedy: str) -> None:
     """Refuse pictures of another camera of the same shape, which would bend what they add."""
     some = [frames[row] for row in np.unique(np.linspace(0, len(frames) - 1, _FOCAL_FRAMES).round().astype(int))]
     inliers = {}
@@ -97,5 +98,5 @@ def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[
     if inliers[best] > _CLEARLY_MORE * inliers[1.0]:
         raise InputError(
             f"{source}: its pictures fit a focal length about {best:g} times the map's. "
-            "Give their camera: --intrinsics FX,FY,CX,CY."
+            f"{remedy}: --intrinsics FX,FY,CX,CY."
         )
