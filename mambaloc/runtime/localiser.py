@@ -100,7 +100,7 @@ class Localiser:
         if self.contract is None or self.contract.intrinsics is None:
             return None
         crop_from_image = self.contract.preprocessing.crop_from_image((size[1], size[0]))
-        return np.linalg.solve(crop_from_image, self.contract.intrinsics)
+        return np.asarray(np.linalg.solve(crop_from_image, self.contract.intrinsics), np.float64)
 
     def localise(
         self, image: str | Path | Image, intrinsics: ArrayLike | None = None, is_distorted: bool = False

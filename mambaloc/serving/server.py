@@ -234,12 +234,15 @@ def serve_bundles(
         token: that requests must carry.
 
     Raises:
-        InputError: for a bundle that cannot be served, an address that cannot be listened at, or no token where others
-            than this machine reach the server.
+        InputError: for a bundle that cannot be served, or that knows no lens where pictures are distorted; an address
+            that cannot be listened at; or no token where others than this machine reach the server.
     """
     if token is None and host not in LOOPBACK:
         raise InputError(f"--host {host}: others may reach it, so a token is needed. Give --token-file FILE.")
     workers = Workers(bundles, count)
+    if limits is not None and limits.is_distorted and workers.without_lens:
+        names = ", ".join(workers.without_lens)
+        raise InputError(f"--distorted: {names} does not know the lens of its camera. Leave --distorted out.")
     try:
         listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except (OSError, OverflowError) as error:

@@ -74,11 +74,14 @@ class Workers:
 
     Attributes:
         scenes: what each bundle knows, by the bundle's name.
+        without_lens: names of bundles that cannot undistort pictures.
         replaced: how many workers were replaced.
     """
 
     def __init__(self, bundles: Mapping[str, Path], count: int, seconds: float = 30.0) -> None:
-        self.scenes = {name: Localiser(path, threads=1).scene for name, path in bundles.items()}
+        localisers = {name: Localiser(path, threads=1) for name, path in bundles.items()}
+        self.scenes = {name: each.scene for name, each in localisers.items()}
+        self.without_lens = [name for name, each in localisers.items() if each.undistortion.lens is None]
         self.count, self.replaced = count, 0
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
         self._workers = [_Worker(bundles, seconds) for _ in range(count)]
