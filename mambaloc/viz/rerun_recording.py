@@ -86,13 +86,14 @@ class RerunRecording:
         else:
             self._stream.set_time(TIME, duration=taken)
         self._count += 1
-        self._stream.log(CAMERA, rr.Clear(recursive=True))  # a frame without a pose must not show the last one's
         size = image.shape[1], image.shape[0]
         if truth is not None:
             self._true_m.append(self._log_pose(TRUTH, truth, intrinsics, size, _TRUE_RGB))
         if pose.source is not None:
             found = pose.position_m, pose.quaternion
             self._estimated_m.append(self._log_pose(CAMERA, found, intrinsics, size, _ESTIMATE_RGB))
+        else:  # the last one's pose and frustum end here; where a new pose comes at the same time, it would end, too
+            self._stream.log(CAMERA, rr.Clear(recursive=True))
         self._stream.log(f"{CAMERA}/image", rr.EncodedImage(contents=_jpeg(image), media_type="image/jpeg"))
         self._log_radius(pose)
         for name, value in _numbers(pose, truth).items():
