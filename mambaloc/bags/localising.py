@@ -37,6 +37,7 @@ def localise_bag(
     intrinsics: ArrayLike | None = None,
     world: str = "map",
     frame: str | None = None,
+    on_picture: Callable[[Picture, Image, ArrayLike | None, Localisation], None] | None = None,
 ) -> Followed:
     """Localise every picture of a bag, and write what a robot's filter takes: poses with covariances, at its times.
 
@@ -52,6 +53,7 @@ def localise_bag(
         intrinsics: of every picture, (3, 3) in pixels; those of ``CameraInfo`` unless given.
         world: the name of the scene's frame in messages.
         frame: whose poses to write, through the bag's transforms; the camera's optical frame unless given.
+        on_picture: is given each picture, it without distortion, its intrinsics, and what was found of it.
 
     Raises:
         InputError: where a bag cannot be read or written, a picture cannot be localised, or none has a pose to write.
@@ -68,6 +70,8 @@ def localise_bag(
                 pictures, "Localising", bag.counts[topic], console=console, transient=True
             ):
                 found.append(localiser.localise(image, matrix))
+                if on_picture is not None:
+                    on_picture(picture, image, matrix, found[-1])
                 stated = _stated(found[-1], body_of(picture))
                 if isinstance(stated, str):
                     left_out[stated] += 1

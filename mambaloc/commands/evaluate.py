@@ -35,6 +35,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--map", type=Path, metavar="FILE", help="measure it beside the network; the run's unless given"
     )
+    parser.add_argument(
+        "--rerun", type=Path, metavar="FILE.rrd", help="also record frames and poses for Rerun's viewer"
+    )
     parser.add_function_arguments(build_data, "data")
     path = parser.parse_args(argv, defaults=False).checkpoint
     if path is None:
@@ -46,12 +49,16 @@ def main(argv: list[str] | None = None) -> None:
     out = args.out or run / "evaluation" / path.stem
     data = build_data(**args.data)
     if isinstance(data, MultiSceneDataModule):
-        if args.map:
-            raise InputError(f"--map {args.map}: is of one scene, and this network knows several. Leave it out.")
+        for option in ("map", "rerun"):
+            if given := args[option]:
+                raise InputError(f"--{option} {given}: is of one scene, and this network knows several. Leave it out.")
         print_scenes(evaluate_scenes(checkpoint, out, data, args.accelerator, args.retrieval))
         print(f"{out}: a folder a scene, each with metrics.json, predictions.csv, predictions.tum, trajectory.png")
         return
     beside = measure_map(args.map, data) if args.map else measure_map_of_run(run, data)
-    print_table([evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval, beside)])
+    measured = evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval, beside, args.rerun)
+    print_table([measured])
     both = ", predictions_both.csv, predictions_both.tum" if beside else ""
     print(f"{out}: metrics.json, predictions.csv, predictions.tum{both}, trajectory.png")
+    if args.rerun is not None:
+        print(f"{args.rerun}: open it with rerun {args.rerun}")

@@ -1,14 +1,24 @@
 """Localise pictures: mambaloc localize [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA_OR_BAG [--filter causal|smooth]."""
 
 from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mambaloc.bags.pictures import Picture
 from mambaloc.bags.reading import is_bag
 from mambaloc.bags.writing import TOPIC
 from mambaloc.console import OptionParser, black_and_white, exits_cleanly, pinhole_matrix, thread_count
 from mambaloc.errors import InputError
+from mambaloc.images import Image
 from mambaloc.runtime import Localiser
-from mambaloc.runtime.video import FILTERS, follow
+from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.sources import SourceFrame
+from mambaloc.runtime.video import FILTERS, Followed, follow
+from mambaloc.viz.rerun_recording import RerunRecording, rerun_recording
 
 
 @exits_cleanly
@@ -57,21 +67,58 @@ def main() -> None:
     parser.add_argument("--topic", metavar="NAME", help="of a bag's pictures, where it has several")
     parser.add_argument("--world-frame", metavar="FRAME", help="that a bag's poses are in; map unless given")
     parser.add_argument("--pose-frame", metavar="FRAME", help="that a bag's poses are of; the camera's unless given")
+    parser.add_argument(
+        "--rerun", type=Path, metavar="FILE.rrd", help="also record frames and poses for Rerun's viewer"
+    )
     parser.add_argument("--threads", type=thread_count, help="that the network may use for one image")
     args = parser.parse_args()
     localiser = Localiser(_model(args.model), args.threads, args.sparse_map)
-    if is_bag(Path(args.source)):
-        _localise_bag(localiser, args)
-        return
-    if args.topic or args.world_frame or args.pose_frame:
+    if not is_bag(Path(args.source)) and (args.topic or args.world_frame or args.pose_frame):
         raise InputError(f"{args.source}: is no ROS bag. Leave --topic, --world-frame and --pose-frame out.")
-    followed = follow(
-        localiser, args.source, args.out, args.filter, args.intrinsics, args.counts, is_distorted=args.distorted
+    with _recording(localiser, args.rerun) as recording:
+        if is_bag(Path(args.source)):
+            said = _localise_bag(localiser, args, recording)
+        else:
+            said = f"{args.out}: {_localise_frames(localiser, args, recording)}"
+    print(said)
+    if args.rerun is not None:
+        print(f"{args.rerun}: open it with rerun {args.rerun}")
+
+
+@contextmanager
+def _recording(localiser: Localiser, path: Path | None) -> Iterator[RerunRecording | None]:
+    if path is None:
+        yield None
+        return
+    with rerun_recording(path, localiser.scene, localiser.world) as recording:
+        if localiser.sparse_map is not None:
+            recording.add_map(localiser.sparse_map)
+        yield recording
+
+
+def _localise_frames(localiser: Localiser, args: Namespace, recording: RerunRecording | None) -> Followed:
+    def record(frame: SourceFrame, pose: Localisation) -> None:
+        image, matrix = frame.image, args.intrinsics
+        if args.distorted:
+            image, matrix = localiser.undistortion.apply(image, args.source)
+        elif matrix is None:
+            matrix = localiser.intrinsics_of((image.shape[1], image.shape[0]))
+        assert recording is not None
+        recording.add_frame(image, pose, frame.time_s, matrix)
+
+    return follow(
+        localiser,
+        args.source,
+        args.out,
+        args.filter,
+        args.intrinsics,
+        args.counts,
+        is_distorted=args.distorted,
+        on_frame=None if recording is None else record,
     )
-    print(f"{args.out}: {followed}")
 
 
-def _localise_bag(localiser: Localiser, args: Namespace) -> None:
+def _localise_bag(localiser: Localiser, args: Namespace, recording: RerunRecording | None) -> str:
     from mambaloc.bags.localising import localise_bag  # only here: an extra
     from mambaloc.importing.formats.ros_bag import straightener
 
@@ -81,6 +128,12 @@ def _localise_bag(localiser: Localiser, args: Namespace) -> None:
         raise InputError(f"--filter {args.filter}: a bag's poses are for a robot's own filter, as found. Leave it out.")
     if args.out.suffix == ".tum":
         raise InputError(f"--out {args.out}: a bag's poses go into a bag. Give --out FILE.bag, or a folder for ROS 2.")
+
+    def record(picture: Picture, image: Image, matrix: ArrayLike | None, pose: Localisation) -> None:
+        assert recording is not None
+        own = localiser.intrinsics_of((image.shape[1], image.shape[0])) if matrix is None else matrix
+        recording.add_frame(image, pose, np.datetime64(picture.ns, "ns"), own)
+
     said = localise_bag(
         localiser,
         Path(args.source),
@@ -90,8 +143,9 @@ def _localise_bag(localiser: Localiser, args: Namespace) -> None:
         args.intrinsics,
         args.world_frame or "map",
         args.pose_frame,
+        on_picture=None if recording is None else record,
     )
-    print(f"{args.out}: {TOPIC}, {said}")
+    return f"{args.out}: {TOPIC}, {said}"
 
 
 def _model(name: str | None) -> Path:

@@ -33,8 +33,10 @@ def main(argv: list[str] | None = None) -> None:
     """Write map.safetensors, coverage.png, and what the map does on test frames."""
     quieten()
     args = _parser().parse_args(argv)
-    if (args.intrinsics is not None or args.name) and not args.add:
-        raise InputError(f"--{'name' if args.name else 'intrinsics'}: is of what --add adds. Leave it out.")
+    of_added = {"name": args.name, "intrinsics": args.intrinsics is not None, "distorted": args.distorted}
+    if not args.add and any(of_added.values()):
+        name = next(name for name, is_given in of_added.items() if is_given)
+        raise InputError(f"--{name}: is of what --add adds. Leave it out.")
     if args.source.suffix == Path(MAP_FILE).suffix or (args.source / MAP_FILE).is_file():
         _change(args)
     else:
@@ -70,7 +72,7 @@ def _change(args: argparse.Namespace) -> None:
     test = read_frames(recipe, "test") if recipe else None
     frames, settings = [], {}
     if args.add:
-        frames = read_new_frames(args.add, MapLocaliser(before), args.intrinsics)
+        frames = read_new_frames(args.add, MapLocaliser(before), args.intrinsics, args.distorted)
         settings = {"key_frames": args.frames or MapSettings.key_frames, "most_bytes": MapSettings.most_bytes}
     cpu = time.process_time()
     if args.add:
@@ -116,8 +118,14 @@ def _parser() -> OptionParser:
     )
     change.add_argument("--remove", metavar="NAME", help="what was added under this name")
     parser.add_argument("--name", help="of what is added, by which it may be removed; that of FRAMES unless given")
-    parser.add_argument(
+    cameras = parser.add_mutually_exclusive_group()
+    cameras.add_argument(
         "--intrinsics", type=pinhole_matrix, metavar="FX,FY,CX,CY", help="of pictures to add; the map's unless given"
+    )
+    cameras.add_argument(
+        "--distorted",
+        action="store_true",
+        help="pictures to add are as the map's camera stores them, and are undistorted by its lens",
     )
     parser.add_argument("--test", type=Path, metavar="RECIPE|SCENE", help="measure the map on its test frames")
     return parser

@@ -19,13 +19,18 @@ def main() -> None:
     parser.add_argument("--workers", type=whole_number(1, 256), default=os.cpu_count(), help="processes that localise")
     parser.add_argument("--token-file", type=Path, help="file of the token that requests must carry")
     parser.add_argument("--megabytes", type=whole_number(1, 1024), default=32, help="largest body of a request")
+    parser.add_argument(
+        "--distorted",
+        action="store_true",
+        help="pictures are as the training camera stores them, unless a request says distorted=false",
+    )
     args = parser.parse_args()
     try:
         from mambaloc.serving import Limits, serve_bundles
     except ModuleNotFoundError as error:
         raise InputError(f"mambaloc serve: needs {error.name}. Install it: pip install 'mambaloc[serve]'") from None
     token = None if args.token_file is None else _token(args.token_file)
-    limits = Limits(body_bytes=args.megabytes * 2**20)
+    limits = Limits(body_bytes=args.megabytes * 2**20, is_distorted=args.distorted)
     serve_bundles(_by_name(args.bundles or [_released_bundle()]), args.host, args.port, args.workers, limits, token)
 
 

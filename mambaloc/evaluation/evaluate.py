@@ -15,6 +15,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import BLOCK, LEVEL, block_resamples, median_interval
 from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.recording import record_test_frames
 from mambaloc.evaluation.references import frozen_features, median_training_pose, nearest_training_pose, retrieval
 from mambaloc.evaluation.trained import Trained, load_trained
 from mambaloc.evaluation.trajectories import write_predictions
@@ -26,6 +27,7 @@ from mambaloc.models.weights import mib, parameter_count
 from mambaloc.nn import PooledBackbone
 from mambaloc.runtime.trajectory import write_tum
 from mambaloc.uncertainty import uncertainty_of_test
+from mambaloc.viz.rerun_recording import check_recording
 from mambaloc.viz.trajectory import draw_trajectory
 
 
@@ -36,6 +38,7 @@ def evaluate_checkpoint(
     accelerator: str = "auto",
     with_retrieval: bool = False,
     beside: MeasuredMap | None = None,
+    rerun: Path | None = None,
 ) -> dict[str, Any]:
     """Localise every test frame with a checkpoint and write the result to a folder.
 
@@ -49,6 +52,7 @@ def evaluate_checkpoint(
         accelerator: as Lightning's Trainer takes it.
         with_retrieval: also measure retrieval on the features that the backbone starts with.
         beside: a map of the place, measured on the same frames.
+        rerun: a recording to write for the Rerun viewer, ending in ``.rrd``.
 
     Returns:
         What ``metrics.json`` holds, with infinity where that has null.
@@ -57,6 +61,8 @@ def evaluate_checkpoint(
         InputError: as :func:`~mambaloc.evaluation.trained.load_trained`, for missing or bad data, or a folder that
             cannot be written.
     """
+    if rerun is not None:
+        check_recording(rerun)  # told now rather than once all is computed
     trained = load_trained(checkpoint, data)
     system, data = trained.system, trained.data
     backbone = _first_backbone(checkpoint) if with_retrieval else None
@@ -85,6 +91,8 @@ def evaluate_checkpoint(
         },
     }
     _write(out, result, table, both, trained)
+    if rerun is not None:
+        record_test_frames(rerun, trained, table, beside, both)
     return result
 
 

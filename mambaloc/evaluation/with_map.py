@@ -40,6 +40,7 @@ class Answers:
         is_accepted: which of them are poses that the map accepts, (N,).
         is_covered: which true poses are inside the 90 % ellipsoid of the answer's covariance, (N,).
         cpu_s: CPU time that the map took on all cores, without decoding the picture, (N,).
+        poses: the answers of a network and a map together, with their radii; none of a map alone.
     """
 
     table: PoseErrorTable
@@ -47,6 +48,7 @@ class Answers:
     is_accepted: NDArray[np.bool_]
     is_covered: NDArray[np.bool_]
     cpu_s: Floats
+    poses: list[Localisation]
 
     @classmethod
     def of(cls, found: Sequence[MapLocalisation | Localisation], frames: Frames, cpu_s: Floats) -> Self:
@@ -56,7 +58,8 @@ class Answers:
         covered = [covers(it.position_m, it.quaternion, it.covariance, truth) for it, truth in pairs]
         sources = ["map" if isinstance(it, MapLocalisation) else str(it.source) for it in found]
         is_accepted = np.array([it.is_accepted for it in found])
-        return cls(_table(found, frames), sources, is_accepted, np.array(covered), cpu_s)
+        poses = [it for it in found if isinstance(it, Localisation)]
+        return cls(_table(found, frames), sources, is_accepted, np.array(covered), cpu_s, poses)
 
     def summary(self) -> dict[str, float]:
         """As :meth:`mambaloc.mapping.evaluating.MapErrors.summary`."""

@@ -27,7 +27,10 @@ _CLEARLY_MORE = 1.3
 
 
 def read_new_frames(
-    source: Path, localiser: MapLocaliser, intrinsics: NDArray[np.float64] | None = None
+    source: Path,
+    localiser: MapLocaliser,
+    intrinsics: NDArray[np.float64] | None = None,
+    is_distorted: bool = False,
 ) -> list[NewFrame]:
     """Read frames and find their keypoints.
 
@@ -36,18 +39,23 @@ def read_new_frames(
             pictures, or a film, of which up to 400 frames are read.
         localiser: in the map that they are for.
         intrinsics: (3, 3) of the pictures; the map's camera unless given.
+        is_distorted: pictures are as the map's camera stores them, and are undistorted by its lens.
 
     Raises:
-        InputError: for what cannot be read, pictures of another shape than the map's without intrinsics, and pictures
-            that clearly fit another focal length than the map's.
+        InputError: for what cannot be read; distorted pictures, where the map knows no lens or they have another shape
+            than its; pictures of another shape than the map's without intrinsics; and pictures that clearly fit another
+            focal length than the map's.
     """
     if source.suffix in (".yaml", ".yml") or (source.is_dir() and is_captured(source)):
         if intrinsics is not None:
             raise InputError(f"{source}: has intrinsics of its own. Leave out --intrinsics.")
+        if is_distorted:
+            raise InputError(f"{source}: a scene's pictures have no distortion. Leave out --distorted.")
         return list(_posed(source, localiser))
-    frames = list(_unposed(source, localiser, intrinsics))
+    frames = list(_unposed(source, localiser, intrinsics, is_distorted))
     if intrinsics is None:
-        _check_focal_length(source, localiser, frames)
+        remedy = "Give them without distortion, and their camera" if is_distorted else "Give their camera"
+        _check_focal_length(source, localiser, frames, remedy)
     return frames
 
 
@@ -60,7 +68,9 @@ def _posed(source: Path, localiser: MapLocaliser) -> Iterator[NewFrame]:
         yield NewFrame(Path(str(image)).name, features, CameraPose(pose[:3, :3], pose[:3, 3]))
 
 
-def _unposed(source: Path, localiser: MapLocaliser, intrinsics: NDArray[np.float64] | None) -> Iterator[NewFrame]:
+def _unposed(
+    source: Path, localiser: MapLocaliser, intrinsics: NDArray[np.float64] | None, is_distorted: bool
+) -> Iterator[NewFrame]:
     frames, count = frames_of(source)
     if count is None:  # some films do not say; they are decoded twice
         count = sum(1 for _ in frames)
@@ -68,10 +78,13 @@ def _unposed(source: Path, localiser: MapLocaliser, intrinsics: NDArray[np.float
     step = max(1, -(-count // _MOST_FRAMES))
     chosen = itertools.islice(frames, 0, None, step)
     for frame in progress(chosen, "keypoints", -(-count // step)):
-        yield NewFrame(frame.name, localiser.features(frame.image, intrinsics))
+        image, matrix = frame.image, intrinsics
+        if is_distorted:
+            image, matrix = localiser.map.undistortion.apply(image, str(source))
+        yield NewFrame(frame.name, localiser.features(image, matrix))
 
 
-def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[NewFrame]) -> None:
+def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[NewFrame], remedy: str) -> None:
     """Refuse pictures of another camera of the same shape, which would bend what they add."""
     some = [frames[row] for row in np.unique(np.linspace(0, len(frames) - 1, _FOCAL_FRAMES).round().astype(int))]
     inliers = {}
@@ -85,5 +98,5 @@ def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[
     if inliers[best] > _CLEARLY_MORE * inliers[1.0]:
         raise InputError(
             f"{source}: its pictures fit a focal length about {best:g} times the map's. "
-            "Give their camera: --intrinsics FX,FY,CX,CY."
+            f"{remedy}: --intrinsics FX,FY,CX,CY."
         )

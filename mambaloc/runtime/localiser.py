@@ -8,13 +8,15 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import Image, as_rgb, read_image
 from mambaloc.runtime.contract import MODEL_FILES, Contract
 from mambaloc.runtime.localisation import Localisation, combined
 from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
+from mambaloc.runtime.maps.features import rescaled_intrinsics
 from mambaloc.runtime.network import Network
 from mambaloc.runtime.sources import SourceFrame, frames_of
 from mambaloc.runtime.undistortion import Undistortion
@@ -86,6 +88,24 @@ class Localiser:
             return self._network.contract
         assert self._map is not None  # one of the two is there
         return self._map.map
+
+    def intrinsics_of(self, size: tuple[int, int]) -> NDArray[np.float64] | None:
+        """The training camera's pinhole matrix (3, 3) in pixels of its pictures of a size.
+
+        Args:
+            size: (width, height).
+
+        Returns:
+            None where neither a map with pictures of that shape nor the network says it.
+        """
+        if self._map is not None:
+            width, height = self._map.map.size
+            if abs(size[0] * height - size[1] * width) <= max(width, height):
+                return rescaled_intrinsics(self._map.map.intrinsics, (width, height), size)
+        if self.contract is None or self.contract.intrinsics is None:
+            return None
+        crop_from_image = self.contract.preprocessing.crop_from_image((size[1], size[0]))
+        return np.asarray(np.linalg.solve(crop_from_image, self.contract.intrinsics), np.float64)
 
     def localise(
         self, image: str | Path | Image, intrinsics: ArrayLike | None = None, is_distorted: bool = False

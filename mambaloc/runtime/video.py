@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from mambaloc.images import Counts
 from mambaloc.runtime.localisation import Localisation
 from mambaloc.runtime.localiser import Localiser
 from mambaloc.runtime.pose_filter import PoseFilter, smooth
-from mambaloc.runtime.sources import frames_of
+from mambaloc.runtime.sources import SourceFrame, frames_of
 from mambaloc.runtime.trajectory import write_tum
 
 FILTERS = ("causal", "smooth")
@@ -71,6 +71,7 @@ def follow(
     intrinsics: ArrayLike | None = None,
     counts: Counts | None = None,
     is_distorted: bool = False,
+    on_frame: Callable[[SourceFrame, Localisation], None] | None = None,
 ) -> Followed:
     """Localise every frame of a source with a progress bar on stderr, and write a TUM trajectory.
 
@@ -85,6 +86,7 @@ def follow(
         intrinsics: of every frame, (3, 3) in pixels; the training camera's unless given.
         counts: black and white of 16-bit pictures, as the scene's were.
         is_distorted: frames are as the training camera stores them, and are undistorted by its lens.
+        on_frame: is given each frame and what was found of it, unfiltered.
 
     Raises:
         InputError: where there is no such source, it holds no frame, one cannot be localised, none has a pose, or
@@ -99,8 +101,11 @@ def follow(
     outliers = None
     try:
         watched = track(frames, "Localising", count, console=console, transient=True)
-        for time_s, pose in localiser.localise_each(watched, intrinsics, is_distorted):
-            found.append((time_s, pose))  # at once, so that Ctrl-C leaves as many times as poses
+        for frame in watched:
+            pose = localiser.localise(frame.image, intrinsics, is_distorted)
+            found.append((frame.time_s, pose))  # at once, so that Ctrl-C leaves as many times as poses
+            if on_frame is not None:
+                on_frame(frame, pose)
     except KeyboardInterrupt:
         pass
     finally:

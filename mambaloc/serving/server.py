@@ -47,11 +47,13 @@ class Limits:
         body_bytes: of a request, whatever its headers say.
         pictures: of a request.
         waiting: pictures that are localised or wait for it, beyond which requests are turned away with status 503.
+        is_distorted: pictures are as the training camera stores them, unless a request says otherwise.
     """
 
     body_bytes: int = 32 * 2**20
     pictures: int = 32
     waiting: int = 256
+    is_distorted: bool = False
 
 
 class _Metrics:
@@ -105,16 +107,29 @@ class _Endpoints:
             names = ", ".join(f"/localize/{each}" for each in self.workers.scenes)
             raise HTTPException(404, f"/localize: several bundles are served. Choose one of {names}.")
         intrinsics = _intrinsics(request.query_params.get("intrinsics"))
+        is_distorted = self._is_distorted(request.query_params.get("distorted"), intrinsics)
         is_form = request.headers.get("content-type", "").startswith(_MULTIPART)
         pictures = await _within(_BODY_S, self._pictures(request, is_form))
         if self.waiting + len(pictures) > self.limits.waiting:
             raise HTTPException(503, f"{self.waiting} pictures wait already. Try again later.", {"Retry-After": "1"})
-        answers = await asyncio.gather(*(self._localised(Task(name, each, intrinsics)) for each in pictures))
+        answers = await asyncio.gather(
+            *(self._localised(Task(name, each, intrinsics, is_distorted)) for each in pictures)
+        )
         if is_form:
             return {"pictures": answers}
         if rule := answers[0].get("error"):
             raise HTTPException(422, rule)
         return answers[0]
+
+    def _is_distorted(self, text: str | None, intrinsics: _Matrix | None) -> bool:
+        """As a request says; unless it does, a picture with intrinsics of its own is a pinhole's."""
+        if text is None:
+            return self.limits.is_distorted and intrinsics is None
+        if text not in ("true", "false"):
+            raise HTTPException(400, "distorted: give true or false.")
+        if text == "true" and intrinsics is not None:
+            raise HTTPException(400, "distorted: the lens says the intrinsics of distorted pictures. Leave out one.")
+        return text == "true"
 
     async def _pictures(self, request: Request, is_form: bool) -> list[bytes]:
         if not is_form:
@@ -219,12 +234,15 @@ def serve_bundles(
         token: that requests must carry.
 
     Raises:
-        InputError: for a bundle that cannot be served, an address that cannot be listened at, or no token where others
-            than this machine reach the server.
+        InputError: for a bundle that cannot be served, or that knows no lens where pictures are distorted; an address
+            that cannot be listened at; or no token where others than this machine reach the server.
     """
     if token is None and host not in LOOPBACK:
         raise InputError(f"--host {host}: others may reach it, so a token is needed. Give --token-file FILE.")
     workers = Workers(bundles, count)
+    if limits is not None and limits.is_distorted and workers.without_lens:
+        names = ", ".join(workers.without_lens)
+        raise InputError(f"--distorted: {names} does not know the lens of its camera. Leave --distorted out.")
     try:
         listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except (OSError, OverflowError) as error:

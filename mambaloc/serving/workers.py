@@ -48,11 +48,13 @@ class Task:
         bundle: name of the bundle.
         picture: an encoded picture: JPEG, PNG and what else :func:`~mambaloc.images.decode_image` takes.
         intrinsics: (3, 3) pinhole matrix in its pixels; the training camera's unless given.
+        is_distorted: it is as the training camera stores it, and is undistorted by its lens.
     """
 
     bundle: str
     picture: bytes
     intrinsics: tuple[tuple[float, ...], ...] | None = None
+    is_distorted: bool = False
 
 
 class WorkerLostError(Exception):
@@ -72,11 +74,14 @@ class Workers:
 
     Attributes:
         scenes: what each bundle knows, by the bundle's name.
+        without_lens: names of bundles that cannot undistort pictures.
         replaced: how many workers were replaced.
     """
 
     def __init__(self, bundles: Mapping[str, Path], count: int, seconds: float = 30.0) -> None:
-        self.scenes = {name: Localiser(path, threads=1).scene for name, path in bundles.items()}
+        localisers = {name: Localiser(path, threads=1) for name, path in bundles.items()}
+        self.scenes = {name: each.scene for name, each in localisers.items()}
+        self.without_lens = [name for name, each in localisers.items() if each.undistortion.lens is None]
         self.count, self.replaced = count, 0
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
         self._workers = [_Worker(bundles, seconds) for _ in range(count)]
@@ -220,7 +225,7 @@ def _answer(localiser: Localiser, task: Task) -> Answer:
         return {"error": image}
     with warnings.catch_warnings(record=True) as told:
         try:
-            found = localiser.localise(image, task.intrinsics)
+            found = localiser.localise(image, task.intrinsics, task.is_distorted)
         except InputError as error:
             return {"error": str(error)}
     answer = {"bundle": task.bundle, "scene": localiser.scene, **pose_of(found)}

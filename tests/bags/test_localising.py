@@ -133,6 +133,27 @@ def test_a_maps_errors_in_the_optical_frame_are_those_of_evaluate(drive, tmp_pat
     np.testing.assert_allclose([found[numbers[row]] for row in accepted], errors, atol=1e-6)
 
 
+def test_a_bags_pictures_are_recorded_at_their_times(drive, tmp_path):
+    """The camera's poses, at the headers' times; a camera of the bag itself gives the frusta."""
+    chunk = pytest.importorskip("rerun.chunk", reason="needs the extra rerun")
+    words = ["--out", tmp_path / "found", "--rerun", tmp_path / "drive.rrd"]
+    tool("localize", drive / "run/map/map.safetensors", drive / "drive", *words)
+    positions_m, matrices = {}, []
+    for each in chunk.RrdReader(tmp_path / "drive.rrd").stream():
+        batch = each.to_record_batch()
+        if each.entity_path == "/world/camera" and "Transform3D:translation" in batch.schema.names:
+            times = batch.column("time").cast("int64").to_pylist()
+            positions_m |= dict(zip(times, batch.column("Transform3D:translation").to_pylist(), strict=True))
+        elif each.entity_path == "/world/camera/image" and "Pinhole:image_from_camera" in batch.schema.names:
+            matrices += batch.column("Pinhole:image_from_camera").to_pylist()
+    sent = messages(tmp_path / "found", TOPIC)
+    assert len(positions_m) == len(matrices) == len(sent)
+    for each in sent:
+        ns = each.header.stamp.sec * 10**9 + each.header.stamp.nanosec
+        np.testing.assert_allclose(positions_m[ns][0], pose_of(each)[:3, 3], atol=1e-6)
+    np.testing.assert_allclose(np.reshape(matrices[0], (3, 3)).T[:2, :2], K[:2, :2], rtol=1e-6)
+
+
 def test_poses_of_the_robot_are_written_by_its_transforms(drive, tmp_path):
     """The camera's pose times its place on the robot, with a covariance that the arm between them makes larger."""
     for name, options in (("camera", []), ("base", ["--pose-frame", "base_link", "--world-frame", "odom"])):

@@ -5,7 +5,13 @@ from __future__ import annotations
 import json
 import runpy
 import shutil
+import signal
+import subprocess
 import sys
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -26,7 +32,7 @@ from mambaloc.runtime.localiser import Localiser
 from mambaloc.runtime.maps import SparseMap
 from mambaloc.runtime.undistortion import Undistortion
 
-TOOL = Path(__file__).parents[2] / "tools" / "localize.py"
+TOOLS = Path(__file__).parents[2] / "tools"
 QUERIES = range(2, 40, 5)  # frames of 40
 
 
@@ -59,9 +65,13 @@ def queries(rendered_once, imported_once, made_once) -> Path:
 
 
 def localize(*words: object) -> None:
+    run_tool("localize", *words)
+
+
+def run_tool(name: str, *words: object) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["tools/localize.py", *map(str, words)])
-        runpy.run_path(str(TOOL), run_name="__main__")
+        patch.setattr(sys, "argv", [f"tools/{name}.py", *map(str, words)])
+        runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
 
 
 # --- the scene -------------------------------------------------------------------------------------------------------
@@ -192,6 +202,78 @@ def test_stored_pictures_get_the_poses_of_the_copies(mapped, queries, rendered_o
     wrong = [localiser.localise(path).position_m for path in sorted((queries / "stored").iterdir())]
     off_m["wrong"] = np.linalg.norm(wrong - truth[:, :3, 3], axis=1)
     assert np.nanmedian(off_m["wrong"]) > 3 * np.median(off_m["stored"])
+
+
+def test_stored_pictures_are_added_to_a_map_as_their_copies_are(mapped, queries, tmp_path):
+    """Guess: the same map, to the last digit."""
+    grown = {}
+    for name, words in (("copies", ()), ("stored", ("--distorted",))):
+        out = tmp_path / name
+        run_tool("map", mapped, "--add", queries / name, "--name", "more", "--out", out, *words)
+        grown[name] = SparseMap.load(out / "map.safetensors")
+    assert grown["stored"].sessions["more"] > 0
+    for array in ("points_m", "descriptors", "views", "key_poses"):
+        np.testing.assert_array_equal(getattr(grown["stored"], array), getattr(grown["copies"], array))
+
+
+@pytest.mark.parametrize(("words", "query"), [((), "?distorted=true"), (("--distorted",), "")])
+def test_a_server_answers_stored_pictures_as_their_copies(mapped, queries, words, query):
+    """Guess: the same to the last digit; a request's own word counts before the server's."""
+    first = sorted((queries / "stored").iterdir())[0]
+    with served(mapped, *words) as url:
+        copy = ask(f"{url}?distorted=false", queries / "copies" / first.name)
+        assert copy["is_accepted"]
+        for key in ("position_m", "quaternion_wxyz", "covariance"):
+            assert ask(f"{url}{query}", first)[key] == copy[key]
+        assert "give true or false" in ask(f"{url}?distorted=1", first)["error"]
+        both = ask(f"{url}?distorted=true&intrinsics=140,140,80,60", first)["error"]
+        assert "Leave out one" in both
+
+
+@contextmanager
+def served(model: Path, *words: str):
+    """The address of a server."""
+    serve = [sys.executable, "-c", "from mambaloc.commands.serve import main; main()"]
+    command = [*serve, str(model), "--port", "0", "--workers", "1", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        url = process.stdout.readline().split(" ")[0]
+        process.stdout.readline()
+        try:
+            for _ in range(300):
+                try:
+                    urllib.request.urlopen(url.split("/localize")[0] + "/health", timeout=5)
+                    break
+                except OSError:
+                    time.sleep(0.1)
+            yield url
+        finally:
+            process.send_signal(signal.SIGINT)
+
+
+def ask(url: str, picture: Path) -> dict:
+    try:
+        with urllib.request.urlopen(url, picture.read_bytes(), timeout=60) as answer:
+            return json.load(answer)
+    except urllib.error.HTTPError as error:
+        return json.load(error)
+
+
+def test_wrong_uses_of_distorted_with_a_map_end_in_one_line(
+    mapped, map_of_den, queries, imported_once, tmp_path, capsys
+):
+    for words, says in (
+        ((map_of_den, "--add", queries / "stored"), "the lens of its pictures is not known"),
+        ((mapped, "--add", imported_once), "a scene's pictures have no distortion. Leave out --distorted."),
+        ((mapped,), "--distorted: is of what --add adds. Leave it out."),
+        ((mapped, "--add", queries / "stored", "--intrinsics", "140,140,80,60"), "not allowed with"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            run_tool("map", *words, "--distorted", "--out", tmp_path / "grown")
+        assert ended.value.code == 2
+        line = capsys.readouterr().err.strip().splitlines()[-1]
+        assert line.startswith("error: ")
+        assert says in line
+    assert not (tmp_path / "grown").exists()
 
 
 def test_wrong_uses_end_in_one_line(mapped, map_of_den, queries, tmp_path, capsys):

@@ -73,14 +73,14 @@ def main() -> None:
         print(f"a loop over Localiser.localise, {each}: {loop_per_second(args.bundle, args.picture, threads):.1f}/s")
     with served(args.bundle, args.workers) as (server, url):
         for clients in CLIENTS:
-            print(
-                f"{clients} clients: {in_words(under_load(url, args.picture, clients, seconds=_SECONDS))}", flush=True
-            )
-        with killing(server, args.kills) as (killed, memory_mib):
+            load = under_load(url, args.picture, clients, seconds=_SECONDS)
+            print(f"{clients} clients: {in_words(load)}", flush=True)
+        every_s = 0.8 * args.requests / load.per_second / (args.kills + 1)  # less, as the load may go faster
+        with killing(server, args.kills, every_s) as (killed, memory_mib):
             load = under_load(url, args.picture, CLIENTS[-1], requests=args.requests)
         lost = args.requests - load.status[200]
         print(f"{args.requests} requests, {len(killed)} workers killed: {in_words(load)}; {lost} lost")
-        print(f"memory of server and workers at each kill: {', '.join(f'{each:.0f}' for each in memory_mib)} MiB")
+        print(f"memory of server and workers, in turn: {', '.join(f'{each:.0f}' for each in memory_mib)} MiB")
 
 
 def loop_per_second(bundle: Path, picture: Path, threads: int | None) -> float:
@@ -139,18 +139,19 @@ def under_load(url: str, picture: Path, clients: int, seconds: float = 0, reques
 
 
 @contextmanager
-def killing(server: int, kills: int) -> Iterator[tuple[list[int], list[float]]]:
-    """Kill a worker every few seconds, in turn, until so many are; and note the memory before each."""
+def killing(server: int, kills: int, every_s: float) -> Iterator[tuple[list[int], list[float]]]:
+    """Kill a worker at regular times, in turn, until so many are; note the memory each time, and on to the end."""
     killed: list[int] = []
     memory_mib: list[float] = []
     is_over = threading.Event()
 
     def kill() -> None:
-        while len(killed) < kills and not is_over.wait(3):
+        while not is_over.wait(every_s):
             workers = workers_of(server)
             memory_mib.append(sum(resident_mib(each) for each in (server, *workers)))
-            os.kill(workers[len(killed) % len(workers)], signal.SIGKILL)
-            killed.append(workers[len(killed) % len(workers)])
+            if len(killed) < kills:
+                os.kill(workers[len(killed) % len(workers)], signal.SIGKILL)
+                killed.append(workers[len(killed) % len(workers)])
 
     thread = threading.Thread(target=kill)
     thread.start()

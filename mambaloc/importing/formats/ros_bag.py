@@ -192,7 +192,7 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
         poses.append(frame.pose)
     if not frames:
         raise InputError(
-            f"{bag.path}: no picture of {topic} has a pose; {gaps or 'none is whole'}. Record both at once."
+            f"{bag.path}: no picture of {topic} has a pose; {str(gaps) or 'none is whole'}. Record both at once."
         )
     np.save(folder / _POSES, np.array(poses))
     note = {
