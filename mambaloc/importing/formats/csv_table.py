@@ -2,7 +2,8 @@
 
 ``scene,split,seq,img_path,t1,t2,t3,q1,q2,q3,q4`` is TransPoseNet's (Shavit et al. 2021,
 ``datasets/CameraPoseDataset.py`` of github.com/yolish/transposenet), ``scene,split,image,x,y,z,qw,qx,qy,qz`` this
-project's; ``tx,ty,tz`` and a ``time`` are understood, too. The position is the camera centre, in metres in these two
+project's; ``tx,ty,tz``, a ``time`` and names with units are understood, too
+(:mod:`~mambaloc.importing.formats.column_names`). The position is the camera centre, in metres in these two
 and an unknown unit in any other. The quaternion is what a dataset's own labels hold: in both tables of 7-Scenes
 camera-to-world, of Cambridge Landmarks **world-to-camera**, and no column says which. So it is taken as
 camera-to-world, unless a row is of a Cambridge scene: then the format must be named, ``csv_world_from_cam`` or
@@ -13,7 +14,8 @@ without a column of images has a time, by which its rows are associated with pic
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -24,6 +26,15 @@ from mambaloc.errors import InputError
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
+from mambaloc.importing.formats.column_names import (
+    TIMES,
+    Column,
+    column_of,
+    find_position,
+    find_quaternion,
+    metres_per_unit,
+    scale_of,
+)
 from mambaloc.importing.formats.finding import Found, count_there, find_pictures
 from mambaloc.importing.formats.parsing import (
     as_numbers,
@@ -37,12 +48,11 @@ from mambaloc.importing.formats.timing import pair, stamps_of
 
 Direction = Literal["world_from_cam", "cam_from_world"]
 
-_IMAGE = ("image", "img_path", "image_path", "path", "file", "filename", "file_name", "image_name", "name")
+_IMAGE = ("image", "img_path", "image_path", "path", "file", "filename", "file_name", "image_name", "name", "img")
 _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("t1", "t2", "t3"))
 _QUATERNIONS = (("qw", "qx", "qy", "qz"), ("q1", "q2", "q3", "q4"))
 _TRANSPOSENET = (_POSITIONS[2], _QUATERNIONS[1])
 _SEQUENCE = ("seq", "sequence")
-_TIME = ("time", "time_s", "timestamp", "timestamp [ns]", "timestamp_ns", "time_ns", "stamp")
 _SPLITS = {"train": "train", "training": "train", "test": "test", "val": "val", "valid": "val", "validation": "val"}
 _NO_FIX = ("", "null", "none", "na", "n/a", "-")
 _CAMBRIDGE = ("KingsCollege", "OldHospital", "ShopFacade", "StMarysChurch", "GreatCourt", "Street")
@@ -57,6 +67,8 @@ class _Columns:
     quaternion: tuple[str, ...]
     sequence: str | None
     time: str | None
+    time_unit: str
+    metres_per_unit: float | None
 
 
 Row = tuple[int, dict[str, str]]
@@ -103,18 +115,18 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
         Posed(
             image,
             sequence,
-            checked.poses[row],
+            checked[row],
             time_s=time_s,
             split=_split(path, *rows[row]),
-            fault=checked.faults.get(row, ""),
         )
         for image, sequence, row, time_s in pictured.frames
     ]
     is_known = columns.position == _POSITIONS[2] or (columns.position == _POSITIONS[0] and "scene" in rows[0][1])
+    known = "metres, as the datasets have them" if is_known else "unknown: the table does not tell"
     choices = {
         "axes": "OpenCV camera axes, as the datasets have them",
         "direction": "world-to-camera, as --format says" if direction == "cam_from_world" else "camera-to-world",
-        "scale": "metres, as the datasets have them" if is_known else "unknown: the table does not tell",
+        "scale": scale_of(columns.metres_per_unit, known),
         "origin": "kept",
         "association": pictured.how,
         **checked.choices,
@@ -123,7 +135,16 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
     missing = pictured.missing
     kind = "csv" if direction is None else f"csv_{direction}"
     unit: Unit = "metre" if is_known else "unknown"
-    return build_capture(kind, path, posed, unit=unit, choices=choices, missing=missing, beside=beside)
+    return build_capture(
+        kind,
+        path,
+        posed,
+        unit=unit,
+        choices=choices,
+        missing=missing,
+        beside=beside,
+        metres_per_unit=columns.metres_per_unit,
+    )
 
 
 def _table(source: Path) -> Path:
@@ -142,8 +163,9 @@ def _rows(path: Path) -> tuple[_Columns, list[Row]]:
     header = text.partition("\n")[0]
     reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=header.count))
     try:
-        names = [name.strip().lower().lstrip("# ") for name in next(reader, [])]
-        columns = _columns(path, names)
+        named = [column_of(name.lstrip("# ")) for name in next(reader, [])]
+        names = _names(path, named)
+        columns = _columns(path, names, dict(zip(names, named, strict=True)))
         rows = []
         for values in reader:
             if len(values) != len(names) and values:
@@ -160,9 +182,18 @@ def _rows(path: Path) -> tuple[_Columns, list[Row]]:
     return columns, rows
 
 
-def _columns(path: Path, names: Sequence[str]) -> _Columns:
-    def the_one(what: str, sets: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-        found = [each for each in sets if set(each) <= set(names)]
+def _names(path: Path, named: Sequence[Column]) -> list[str]:
+    """A name for each column: without its unit, where only one has that."""
+    twice = next((column.name for column in named if column.name and named.count(column) > 1), None)
+    if twice:
+        raise InputError(f"{path}, line 1: names the column {twice[:40]!r} twice; remove one")
+    count = Counter(column.name for column in named)
+    return [column.name if count[column.name] == 1 else f"{column.name} [{column.unit}]" for column in named]
+
+
+def _columns(path: Path, names: Sequence[str], named: Mapping[str, Column]) -> _Columns:
+    def the_one(what: str, sets: Sequence[tuple[str, ...]], others: Sequence[tuple[str, ...]] = ()) -> tuple[str, ...]:
+        found = [each for each in sets if set(each) <= set(names)] or others
         if len(found) != 1:
             wanted = " or ".join(",".join(each) for each in sets)
             raise InputError(
@@ -174,18 +205,18 @@ def _columns(path: Path, names: Sequence[str]) -> _Columns:
         found = [name for name in known if name in names]
         return the_one(what, [(name,) for name in known])[0] if found else None
 
-    twice = next((name for name in names if name and names.count(name) > 1), None)
-    if twice:
-        raise InputError(f"{path}, line 1: names the column {twice[:40]!r} twice; remove one")
-    time, image = at_most_one("time", _TIME), at_most_one("image file", _IMAGE)
+    time, image = at_most_one("time", TIMES), at_most_one("image file", _IMAGE)
     if image is None and time is None:
         the_one("image file", [(name,) for name in _IMAGE])
+    position = the_one("position", _POSITIONS, find_position(names))
     columns = _Columns(
         image=image,
-        position=the_one("position", _POSITIONS),
-        quaternion=the_one("quaternion", _QUATERNIONS),
+        position=position,
+        quaternion=the_one("quaternion", _QUATERNIONS, find_quaternion(names)),
         sequence=at_most_one("sequence", _SEQUENCE),
         time=time,
+        time_unit="" if time is None else named[time].unit,
+        metres_per_unit=metres_per_unit([named[name] for name in position], f"{path}, line 1"),
     )
     if columns.quaternion == _QUATERNIONS[1] and (columns.position, columns.quaternion) != _TRANSPOSENET:
         raise InputError(f"{path}, line 1: q1,q2,q3,q4 do not say which is the scalar; name them qw,qx,qy,qz")
@@ -234,7 +265,7 @@ def _by_image(path: Path, rows: list[Row], columns: _Columns, given: Path | None
     images, how = found.files, "; ".join(filter(None, ("by name", found.elsewhere)))
     stamps = None
     if columns.time is not None:
-        stamps = stamps_of([row[columns.time] for _, row in rows])
+        stamps = stamps_of([row[columns.time] for _, row in rows], said=columns.time_unit)
         if stamps is None:
             line, row = next(((line, row) for line, row in rows if stamps_of([row[columns.time]]) is None), rows[0])
             time = row[columns.time][:40]
