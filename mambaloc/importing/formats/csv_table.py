@@ -14,8 +14,6 @@ without a column of images has a time, by which its rows are associated with pic
 from __future__ import annotations
 
 import csv
-from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -26,15 +24,7 @@ from mambaloc.errors import InputError
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
-from mambaloc.importing.formats.column_names import (
-    TIMES,
-    Column,
-    column_of,
-    find_position,
-    find_quaternion,
-    metres_per_unit,
-    scale_of,
-)
+from mambaloc.importing.formats.column_names import scale_of
 from mambaloc.importing.formats.finding import Found, count_there, find_pictures
 from mambaloc.importing.formats.parsing import (
     as_numbers,
@@ -44,32 +34,14 @@ from mambaloc.importing.formats.parsing import (
     read_text,
 )
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS
+from mambaloc.importing.formats.table_columns import POSITIONS, TableColumns, columns_of
 from mambaloc.importing.formats.timing import pair, stamps_of
 
 Direction = Literal["world_from_cam", "cam_from_world"]
 
-_IMAGE = ("image", "img_path", "image_path", "path", "file", "filename", "file_name", "image_name", "name", "img")
-_POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("t1", "t2", "t3"))
-_QUATERNIONS = (("qw", "qx", "qy", "qz"), ("q1", "q2", "q3", "q4"))
-_TRANSPOSENET = (_POSITIONS[2], _QUATERNIONS[1])
-_SEQUENCE = ("seq", "sequence")
 _SPLITS = {"train": "train", "training": "train", "test": "test", "val": "val", "valid": "val", "validation": "val"}
 _NO_FIX = ("", "null", "none", "na", "n/a", "-")
 _CAMBRIDGE = ("KingsCollege", "OldHospital", "ShopFacade", "StMarysChurch", "GreatCourt", "Street")
-
-
-@dataclass(frozen=True)
-class _Columns:
-    """Which column holds what."""
-
-    image: str | None
-    position: tuple[str, ...]
-    quaternion: tuple[str, ...]
-    sequence: str | None
-    time: str | None
-    time_unit: str
-    metres_per_unit: float | None
-
 
 Row = tuple[int, dict[str, str]]
 
@@ -121,7 +93,7 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
         )
         for image, sequence, row, time_s in pictured.frames
     ]
-    is_known = columns.position == _POSITIONS[2] or (columns.position == _POSITIONS[0] and "scene" in rows[0][1])
+    is_known = columns.position == POSITIONS[2] or (columns.position == POSITIONS[0] and "scene" in rows[0][1])
     known = "metres, as the datasets have them" if is_known else "unknown: the table does not tell"
     choices = {
         "axes": "OpenCV camera axes, as the datasets have them",
@@ -157,15 +129,14 @@ def _table(source: Path) -> Path:
     return tables[0]
 
 
-def _rows(path: Path) -> tuple[_Columns, list[Row]]:
+def _rows(path: Path) -> tuple[TableColumns, list[Row]]:
     """The columns, and each row with its line."""
     text = read_text(path, "a table of poses with its columns' names in the first line")
     header = text.partition("\n")[0]
     reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=header.count))
     try:
-        named = [column_of(name.lstrip("# ")) for name in next(reader, [])]
-        names = _names(path, named)
-        columns = _columns(path, names, dict(zip(names, named, strict=True)))
+        columns = columns_of(path, next(reader, []))
+        names = columns.names
         rows = []
         for values in reader:
             if len(values) != len(names) and values:
@@ -182,47 +153,6 @@ def _rows(path: Path) -> tuple[_Columns, list[Row]]:
     return columns, rows
 
 
-def _names(path: Path, named: Sequence[Column]) -> list[str]:
-    """A name for each column: without its unit, where only one has that."""
-    twice = next((column.name for column in named if column.name and named.count(column) > 1), None)
-    if twice:
-        raise InputError(f"{path}, line 1: names the column {twice[:40]!r} twice; remove one")
-    count = Counter(column.name for column in named)
-    return [column.name if count[column.name] == 1 else f"{column.name} [{column.unit}]" for column in named]
-
-
-def _columns(path: Path, names: Sequence[str], named: Mapping[str, Column]) -> _Columns:
-    def the_one(what: str, sets: Sequence[tuple[str, ...]], others: Sequence[tuple[str, ...]] = ()) -> tuple[str, ...]:
-        found = [each for each in sets if set(each) <= set(names)] or others
-        if len(found) != 1:
-            wanted = " or ".join(",".join(each) for each in sets)
-            raise InputError(
-                f"{path}, line 1: must name the {what} once ({wanted}); it names {','.join(names)[:200]!r}"
-            )
-        return found[0]
-
-    def at_most_one(what: str, known: Sequence[str]) -> str | None:
-        found = [name for name in known if name in names]
-        return the_one(what, [(name,) for name in known])[0] if found else None
-
-    time, image = at_most_one("time", TIMES), at_most_one("image file", _IMAGE)
-    if image is None and time is None:
-        the_one("image file", [(name,) for name in _IMAGE])
-    position = the_one("position", _POSITIONS, find_position(names))
-    columns = _Columns(
-        image=image,
-        position=position,
-        quaternion=the_one("quaternion", _QUATERNIONS, find_quaternion(names)),
-        sequence=at_most_one("sequence", _SEQUENCE),
-        time=time,
-        time_unit="" if time is None else named[time].unit,
-        metres_per_unit=metres_per_unit([named[name] for name in position], f"{path}, line 1"),
-    )
-    if columns.quaternion == _QUATERNIONS[1] and (columns.position, columns.quaternion) != _TRANSPOSENET:
-        raise InputError(f"{path}, line 1: q1,q2,q3,q4 do not say which is the scalar; name them qw,qx,qy,qz")
-    return columns
-
-
 def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
     scenes = list(dict.fromkeys(row.get("scene", "") for _, row in rows))
     if len(scenes) == 1:
@@ -237,7 +167,7 @@ def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
     return chosen
 
 
-def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction: Direction | None) -> None:
+def _refuse_cambridge(path: Path, rows: list[Row], columns: TableColumns, direction: Direction | None) -> None:
     for line, row in rows:
         first = row.get(columns.image or "", "").replace("\\", "/").partition("/")[0]
         if direction is None and any(name in (row.get("scene"), first) for name in _CAMBRIDGE):
@@ -247,7 +177,7 @@ def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction:
             )
 
 
-def _numbers(path: Path, line: int, row: dict[str, str], columns: _Columns) -> np.ndarray:
+def _numbers(path: Path, line: int, row: dict[str, str], columns: TableColumns) -> np.ndarray:
     words = [row[name] for name in (*columns.position, *columns.quaternion)]
     values = as_numbers(["nan" if word.lower() in _NO_FIX else word for word in words])
     if values is None:
@@ -260,7 +190,7 @@ def _turned(quaternion: np.ndarray, direction: Direction | None) -> np.ndarray:
     return quaternion * (1, -1, -1, -1) if direction == "cam_from_world" else quaternion
 
 
-def _by_image(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> _Pictured:
+def _by_image(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> _Pictured:
     folder, found = _images(path, rows, columns, given)
     images, how = found.files, "; ".join(filter(None, ("by name", found.elsewhere)))
     stamps = None
@@ -280,7 +210,7 @@ def _by_image(path: Path, rows: list[Row], columns: _Columns, given: Path | None
     return _Pictured(frames, how if stamps is None else f"{how}; timed in {stamps.unit}", missing)
 
 
-def _by_time(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> _Pictured:
+def _by_time(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> _Pictured:
     images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, [row[str(columns.time)] for _, row in rows], path)
     name = folder_name(path.parent)
@@ -288,7 +218,7 @@ def _by_time(path: Path, rows: list[Row], columns: _Columns, given: Path | None)
     return _Pictured(sorted(frames, key=lambda frame: frame[3] or 0.0), pairing.how, pairing.missing)
 
 
-def _images(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> tuple[Path, Found]:
+def _images(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> tuple[Path, Found]:
     """The folder that the table's names are relative to, and each row's file there."""
     names = [(row[str(columns.image)], row.get("scene", ""), f"{path}, line {line}") for line, row in rows]
     whole = [(name, where) for name, _, where in names]

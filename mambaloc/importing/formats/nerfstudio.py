@@ -1,8 +1,9 @@
 """``transforms.json`` of nerfstudio and instant-ngp, and NeRF's ``transforms_train.json`` with its companions.
 
-Each frame has a camera-to-world matrix in OpenGL's camera axes: x right, y up, z back; its numbers may come in rows or in
-one list, and column after column where only that gives rotations, as WebGL and ARKit write them. ScanNet++ has ``test_frames``
-beside ``frames``, and marks frames that are blurred or in shadow ``is_bad`` (github.com/scannetpp/scannetpp).
+Each frame has a camera-to-world matrix in OpenGL's camera axes: x right, y up, z back. Its numbers come in rows or in
+one list, and column after column where only that gives rotations, as WebGL and ARKit have them. ScanNet++ has
+``test_frames`` beside ``frames``, and marks frames that are blurred or in shadow ``is_bad``
+(github.com/scannetpp/scannetpp).
 """
 
 from __future__ import annotations
