@@ -133,7 +133,8 @@ def _rows(path: Path) -> tuple[TableColumns, list[Row]]:
     """The columns, and each row with its line."""
     text = read_text(path, "a table of poses with its columns' names in the first line")
     header = text.partition("\n")[0]
-    reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=header.count))
+    delimiter = max(",;\t", key=header.count)
+    reader = csv.reader(text.splitlines(), delimiter=delimiter)
     try:
         columns = columns_of(path, next(reader, []))
         names = columns.names
@@ -150,7 +151,17 @@ def _rows(path: Path) -> tuple[TableColumns, list[Row]]:
         raise InputError(f"{path}, line {reader.line_num}: is no CSV ({error}); export it again") from None
     if not rows:
         raise InputError(f"{path}: has no row below its columns' names; add them")
-    return columns, rows
+    return columns, rows if delimiter == "," else _with_points(rows, columns)
+
+
+def _with_points(rows: list[Row], columns: TableColumns) -> list[Row]:
+    """Rows whose numbers have points, where no number of the poses has one, but commas, as spreadsheets write them."""
+    names = (*columns.position, *columns.quaternion)
+    words = [row[name] for _, row in rows for name in names]
+    if any("." in word for word in words) or not any("," in word for word in words):
+        return rows
+    names += () if columns.time is None else (columns.time,)
+    return [(line, {**row, **{name: row[name].replace(",", ".") for name in names}}) for line, row in rows]
 
 
 def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:

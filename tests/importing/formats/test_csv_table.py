@@ -108,6 +108,16 @@ def test_names_of_columns_as_programs_write_them(folder, recording, header, leng
     np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-12)
 
 
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_decimal_commas_of_spreadsheets(folder, recording, delimiter):
+    header, *rows = lines(recording, [*OURS[2:], "time"], delimiter=delimiter).splitlines()
+    rows = [delimiter.join([row.split(delimiter)[0], *row.replace(".", ",").split(delimiter)[1:]]) for row in rows]
+    (folder / "poses.csv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-16")
+    capture = read_capture(folder)
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-12)
+    np.testing.assert_allclose(capture.time_s, np.arange(FRAMES) / 10)
+
+
 def test_velocities_and_covariances_are_no_positions(folder, recording):
     header = "image,pos_x,pos_y,pos_z,q_w,q_x,q_y,q_z,v_x,v_y,v_z,position_covariance_x,px,py"
     rows = [f"{row},9,9,9,9,9,9" for row in lines(recording, OURS[2:]).splitlines()[1:]]

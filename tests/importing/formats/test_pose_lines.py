@@ -83,6 +83,16 @@ def test_headers_of_trajectories_as_programs_write_them(recording, tmp_path, hea
     np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
 
 
+def test_a_file_may_mix_units_of_times_since_1970(recording, tmp_path):
+    """A logger that was updated: milliseconds at first, then nanoseconds."""
+    ns = [1700000000_123_000_000 + row * 100_000_000 for row in range(FRAMES)]
+    words = [str(each // 10**6 if row < 3 else each) for row, each in enumerate(ns)]
+    lines = [f"{word} {line}" for word, line in zip(words, sevens(recording, "tvw"), strict=True)]
+    capture = read_capture(write(recording, tmp_path, lines, "trajectory.txt", [f"{each}.jpg" for each in ns]))
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-9)
+    assert "poses are timed in ms and ns" in capture.choices["association"]
+
+
 HEADERS = [
     ("# timestamp {}[mm] {}[mm] {}[mm] qw qx qy qz", "mm", 0.001),
     ("# timestamp {}_cm {}_cm {}_cm qw qx qy qz", "cm", 0.01),
