@@ -45,7 +45,8 @@ def column_of(name: str) -> Column:
     """What a column's name says."""
     name = name.strip().strip("\"'").lower()
     match = _BRACKETED.fullmatch(name) or _OF_LENGTH.fullmatch(name) or _OF_TIME.fullmatch(name)
-    return Column(name) if match is None else Column(match[1], match[2].strip())
+    name, unit = (name, "") if match is None else (match[1], match[2].strip())
+    return Column(re.sub(r"\s+", "_", name), unit)
 
 
 def columns_in(line: str) -> tuple[Column, ...]:

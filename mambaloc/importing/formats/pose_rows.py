@@ -89,7 +89,8 @@ class Layout:
 
 
 def split_line(line: str) -> tuple[str, list[str]]:
-    """A line's leading word, and the words after it; a picture's name may hold spaces."""
+    """A line's leading word, and the words after it; a picture's name may hold spaces, and be in quotes."""
+    line = line.replace('"', "")
     named = _AFTER_PICTURE.fullmatch(line.strip())
     if named:
         return named[1], re.split(r"[\s,;]+", named[2].strip(" \t,;"))

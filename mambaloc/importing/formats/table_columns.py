@@ -22,6 +22,7 @@ POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("t1", "t2", "t3"))
 """Columns of a position: of tables of this project and others, and of TransPoseNet's, the last."""
 _QUATERNIONS = (("qw", "qx", "qy", "qz"), ("q1", "q2", "q3", "q4"))
 _TRANSPOSENET = (POSITIONS[2], _QUATERNIONS[1])
+_FRAME = ("frame", "frame_number", "frame_index", "index")
 _SEQUENCE = ("seq", "sequence")
 
 
@@ -35,7 +36,7 @@ class TableColumns:
         position: three.
         quaternion: four, scalar first.
         sequence: of a recording, where there is one.
-        time: likewise.
+        time: likewise; of a table without images, a frame's number where there is no time.
         time_unit: that the time's name says; empty where it says none.
         metres_per_unit: what the position's names say; None where they say nothing.
     """
@@ -87,6 +88,8 @@ def columns_of(path: Path, header: Sequence[str]) -> TableColumns:
         return the_one(what, [(name,) for name in known])[0] if found else None
 
     time, image = at_most_one("time", TIMES), at_most_one("image file", _IMAGE)
+    if image is None and time is None:
+        time = at_most_one("frame's number", _FRAME)
     if image is None and time is None:
         the_one("image file", [(name,) for name in _IMAGE])
     position = the_one("position", POSITIONS, find_position(names))

@@ -88,6 +88,8 @@ NAMED = {
     "#filename;p_RS_R_x [m];p_RS_R_y [m];p_RS_R_z [m];q_RS_w [];q_RS_x [];q_RS_y [];q_RS_z []": 1.0,
     "name,pose.position.x,pose.position.y,pose.position.z,pose.orientation.w,pose.orientation.x,pose.orientation.y,"
     "pose.orientation.z": None,
+    "Image Name,Position X [km],Position Y [km],Position Z [km],Quaternion W,Quaternion X,Quaternion Y,"
+    "Quaternion Z": 1000.0,
     "img,tx_cm,ty_cm,tz_cm,quat_w,quat_x,quat_y,quat_z": 0.01,
 }
 
@@ -106,6 +108,13 @@ def test_names_of_columns_as_programs_write_them(folder, recording, header, leng
     capture, _ = in_its_world(capture, None)
     assert capture.unit == ("unknown" if length_m is None else "metre")
     np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-12)
+
+
+def test_frames_by_their_numbers(recording, tmp_path):
+    recording.write(tmp_path / "images", [f"frame_{number:05d}.jpg" for number in range(FRAMES)])
+    names = list(map(str, range(FRAMES)))
+    (tmp_path / "poses.csv").write_text(lines(recording, OURS[2:], names=names).replace("image", "frame", 1))
+    np.testing.assert_allclose(read_capture(tmp_path).world_from_cam, recording.world_from_cam, atol=1e-12)
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t"])

@@ -83,6 +83,13 @@ def test_headers_of_trajectories_as_programs_write_them(recording, tmp_path, hea
     np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
 
 
+def test_names_in_quotes(recording, tmp_path):
+    names = [f"my picture {row}.jpg" for row in range(FRAMES)]
+    lines = [f'"{name}" {line}' for name, line in zip(names, sevens(recording, "twv"), strict=True)]
+    source = write(recording, tmp_path, ["# image x y z qw qx qy qz", *lines], names=names)
+    np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
+
+
 def test_a_file_may_mix_units_of_times_since_1970(recording, tmp_path):
     """A logger that was updated: milliseconds at first, then nanoseconds."""
     ns = [1700000000_123_000_000 + row * 100_000_000 for row in range(FRAMES)]
