@@ -89,7 +89,8 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
             if record.row is None:
                 continue
             device = checked[record.row]
-            pose = replace(device, world_from_cam=np.linalg.inv(record.sensor_from_device @ device.world_from_cam))
+            world_from_cam = np.linalg.inv(record.sensor_from_device @ device.world_from_cam).astype(np.float64)
+            pose = replace(device, world_from_cam=world_from_cam)
             told = Posed(file, _sequence(file, root), pose, split=record.split)
             frames.append((record.key, told, _told(sensors, record)))
         choices |= {**found.choices, **checked.choices}
