@@ -108,7 +108,9 @@ def _parser() -> OptionParser:
         help="key frames, of the training frames or of those added; 160",
     )
     parser.add_argument(
-        "--width", type=whole_number(LEAST["width"]), help="of the pictures in which keypoints are searched, in pixels"
+        "--width",
+        type=whole_number(LEAST["width"]),
+        help="of the pictures in which keypoints are searched, in pixels; narrower ones are searched as they are",
     )
     parser.add_argument("--points", choices=POINTS, help="our own unless given, or those of an imported COLMAP model")
     parser.add_argument("--out", type=Path, help="folder to write to; a new map's is runs/NAME unless given")

@@ -62,6 +62,7 @@ class Capture:
         sequences: N names of recordings.
         world_from_cam: (N, 4, 4) float64, OpenCV camera axes.
         unit: of positions: ``unknown`` where the format's scale is arbitrary.
+        metres_per_unit: what the source says of its unit; None where it says nothing, or always has the same.
         choices: what was decided of axes, direction, scale and origin, and why, by name; goes into ``scene.json``.
         cameras: by name; empty where the format tells of none.
         camera_of: N names, or None where the format tells of none.
@@ -92,4 +93,5 @@ class Capture:
     left_out: Mapping[str, str] = field(default_factory=dict)
     depth: Depth | None = None
     tracks: Tracks | None = None
+    metres_per_unit: float | None = None
     world: World = field(default_factory=World)

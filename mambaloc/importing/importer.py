@@ -44,7 +44,7 @@ def import_scene(
         source: the capture.
         out: the scene's folder, which must not be there yet.
         kind: the capture's format; found out unless given.
-        metres_per_unit: what the format's unit is; as the format tells unless given.
+        metres_per_unit: what the source's unit is; as the source tells unless given.
         split: of :data:`~mambaloc.importing.splits.selection.ASKED`.
         command: that this was asked for with.
         with_adjusted: also write poses that are adjusted to the pictures, in a file of their own.

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from mambaloc.importing.capture import Capture
-from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
+from mambaloc.runtime.rotations import degrees_of_chords, quaternion_from_matrix, rotation_error_deg
 
 Floats = NDArray[np.float64]
 
@@ -97,8 +98,9 @@ def apart(
     at_once = max(1, _PAIRS_AT_ONCE // max(1, len(others)))
     for start in range(0, len(rows), at_once):
         block = slice(start, start + at_once)
-        length[block] = np.linalg.norm(position[rows[block], None] - position[others], axis=-1)
-        turn_deg[block] = rotation_error_deg(quaternion[rows[block], None], quaternion[others])
+        length[block] = cdist(position[rows[block]], position[others])
+        turned = quaternion[rows[block]]
+        turn_deg[block] = degrees_of_chords(cdist(turned, quaternion[others]), cdist(turned, -quaternion[others]))
     return length, turn_deg
 
 

@@ -47,13 +47,16 @@ def _without(capture: Capture, rules: Mapping[int, str]) -> tuple[Capture, dict[
 
 
 def _in_metres(capture: Capture, metres_per_unit: float | None) -> Capture:
-    if metres_per_unit is None:
+    said = capture.choices.get("scale", "")
+    if metres_per_unit is not None:
+        told = f"multiplied by {metres_per_unit:g}, as --metres-per-unit says; otherwise: {said}"
+    elif capture.metres_per_unit in (None, 1.0):
         return capture
+    else:
+        metres_per_unit = capture.metres_per_unit
+        told = f"multiplied by {metres_per_unit:g}: {said}"
     world_from_cam = capture.world_from_cam.copy()
     world_from_cam[:, :3, 3] *= metres_per_unit
-    told = (
-        f"multiplied by {metres_per_unit:g}, as --metres-per-unit says; otherwise: {capture.choices.get('scale', '')}"
-    )
     depth = capture.depth and replace(capture.depth, step=capture.depth.step * metres_per_unit)
     choices = {**capture.choices, "scale": told}
     tracks = capture.tracks and capture.tracks.moved(metres_per_unit, np.zeros(3))

@@ -88,7 +88,7 @@ class MapSettings:
 
     Args:
         key_frames: how many, at most.
-        width: of the pictures in which keypoints are searched, in pixels.
+        width: of the pictures in which keypoints are searched, in pixels; narrower ones are searched as they are.
         most_bytes: budget of points and descriptors.
         least_inliers: how many inliers a pose needs to be accepted.
         seed: of the views that triangulation draws.
@@ -199,7 +199,7 @@ def _searched(
         if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
             raise InputError(
                 f"{scene}: its frames have {keypoints:.0f} keypoints each. "
-                "Film surfaces with more texture, or use a larger width."
+                "Film surfaces with more texture, or give larger pictures and a larger width."
             )
         matches = _each(pool, matched, range(len(key)), "matches")
     return features, list(itertools.chain.from_iterable(matches))

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb, read_image
 from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps.features import Features, Keypoints, find_keypoints
@@ -36,17 +35,15 @@ def kept_keypoints(image: Path | Image, width: int, name: str | None) -> Keypoin
 
     Args:
         image: path or RGB array (H, W, 3).
-        width: of the picture in which they are searched, in pixels.
+        width: of the picture in which they are searched, in pixels; a narrower one is searched as it is.
         name: as :func:`picture_name` gives it.
 
     Raises:
-        InputError: for a bad picture, or one that is narrower than ``width``; or where the cache cannot be written.
+        InputError: for a bad picture, or where the cache cannot be written.
     """
 
     def make() -> dict[str, NDArray[Any]]:
         rgb = read_image(image) if isinstance(image, Path) else as_rgb(image)
-        if width > rgb.shape[1]:
-            raise InputError(f"width {width}: the pictures are {rgb.shape[1]} pixels wide. Give at most that.")
         return find_keypoints(rgb, width / rgb.shape[1])._asdict()
 
     return Keypoints(**_kept(name and f"keypoints/{name}", make))

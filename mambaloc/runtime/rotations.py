@@ -114,8 +114,12 @@ def rotation_error_deg(a: ArrayLike, b: ArrayLike) -> Floats:
     From chord lengths: an arccos loses half its digits near 0.
     """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    chords = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
-    return np.degrees(4 * np.arctan2(np.minimum(*chords), np.maximum(*chords)))
+    return degrees_of_chords(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+
+
+def degrees_of_chords(minus: Floats, plus: Floats) -> Floats:
+    """Angle of the rotation between unit quaternions, 0..180 degrees, of the lengths of their difference and sum."""
+    return np.degrees(4 * np.arctan2(np.minimum(minus, plus), np.maximum(minus, plus)))
 
 
 def rigid_transforms(rotation: ArrayLike, position: ArrayLike) -> Floats:

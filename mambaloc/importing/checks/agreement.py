@@ -12,7 +12,7 @@ from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks.adjusting import Adjusted, adjust_poses
 from mambaloc.importing.checks.depth import ByDepth, by_depth
 from mambaloc.importing.checks.epipolar import FOCALS, Bin, best_focal, by_baseline, by_focal
-from mambaloc.importing.checks.explanations import AS_READ, Order, better_order, by_convention
+from mambaloc.importing.checks.explanations import AS_READ, WORLD_TO_CAMERA, Order, better_order, by_convention
 from mambaloc.importing.checks.findings import Finding
 from mambaloc.importing.checks.matching import find_matches, intrinsics
 from mambaloc.importing.motion import Motion
@@ -27,6 +27,7 @@ _SAME_FOCAL = 0.03
 _WORSE = 1.25
 _DRIFT = 0.5  # of what is possible
 _AS_GIVEN = int(np.abs(FOCALS - 1).argmin())
+_OF_EITHER_DIRECTION = ("csv", "pose_lines", "pose_files")  # formats that may be read as KIND_cam_from_world
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class Agreement:
         order: another association of pictures with poses that fits clearly better.
         depth: what depth says, where the capture has some.
         adjusted: poses adjusted to the pictures, where they were asked for.
+        kind: the capture's format.
     """
 
     share: dict[str, float]
@@ -56,6 +58,7 @@ class Agreement:
     order: Order | None = None
     depth: ByDepth | None = None
     adjusted: Adjusted | None = None
+    kind: str = ""
 
     @property
     def best(self) -> str:
@@ -110,6 +113,7 @@ def agreement(capture: Capture, motion: Motion, with_adjusted: bool = False) -> 
         better_order(capture, matches),
         by_depth(capture, matches),
         adjusted,
+        capture.kind,
     )
 
 
@@ -141,13 +145,19 @@ def check_agreement(found: Agreement) -> list[Finding]:
     return findings
 
 
+def _remedy(convention: str, kind: str) -> str:
+    if convention == WORLD_TO_CAMERA and kind in _OF_EITHER_DIRECTION:
+        return f"import them with --format {kind}_cam_from_world"
+    return "convert them to camera to world in OpenCV's axes (x right, y down, z forward), and import them again"
+
+
 def _contradiction(found: Agreement) -> str:
     """What is wrong with the poses, and what to do; empty where nothing is."""
     share, best = found.share[AS_READ], found.best
     if best != AS_READ and found.share[best] >= _AGREE and found.share[best] > share + _PLAINLY:
         return (
             f"the poses look like {best}: {found.share[best]:.0%} of matches agree with that, {share:.0%} with them "
-            f"{AS_READ}; convert them, or name the format that says so with --format"
+            f"{AS_READ}; {_remedy(best, found.kind)}"
         )
     order = found.order
     if order is not None and order.share >= _AGREE and not found.is_of_another_lens:

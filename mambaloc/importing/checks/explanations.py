@@ -39,9 +39,10 @@ def _with_other_scalar(rolled: int) -> Callable[[Floats], Floats]:
 _FIRST, _LAST = _with_other_scalar(-1), _with_other_scalar(1)
 
 AS_READ = "as they were read"
+WORLD_TO_CAMERA = "world to camera"
 CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
     AS_READ: lambda poses: poses,
-    "world to camera": np.linalg.inv,
+    WORLD_TO_CAMERA: np.linalg.inv,
     "camera to world in OpenGL's axes": lambda poses: poses @ OPENCV_FROM_OPENGL,
     "world to camera in OpenGL's axes": lambda poses: np.linalg.inv(poses) @ OPENCV_FROM_OPENGL,
     "camera to world with the quaternions' scalar first": _FIRST,

@@ -165,13 +165,21 @@ def check_duplicates(capture: Capture, motion: Motion) -> Finding:
     ).round()
     many = len(grid) - len(np.unique(grid, axis=0))
     run, concern = _longest_run(grid, capture.sequences), ""
-    if many > _MANY * len(grid) or len(run) >= _LEAST_STILL:
-        concern = f"{many} frames have exactly the pose of another: tracking may have stood still"
+    if many >= len(grid) - 1:
+        concern = "all frames have the same pose: the tracker was lost, or did not move; export poses that differ"
+        return Finding("duplicate poses", f"{many}", concern, True, {"count": many})
     if len(run) >= _LEAST_STILL:
         first, last = (capture.images[run[end]].name for end in (0, -1))
-        concern += f" in {len(run)} successive frames, {first} to {last}; remove these if the camera moved there"
-    if many >= len(grid) - 1:
-        return Finding("duplicate poses", f"{many}", "all frames have the same pose", True, {"count": many})
+        concern = (
+            f"{many} frames have exactly the pose of another, most in a row {first} to {last} ({len(run)} frames): a "
+            "tracker that is lost repeats its last pose; if these pictures show that the camera moved, take them and "
+            "their poses out of the capture and import it again"
+        )
+    elif many > _MANY * len(grid):
+        concern = (
+            f"{many} frames have exactly the pose of another: pictures may be there twice, or poses with too few "
+            "digits; remove copies, or export poses with six decimals"
+        )
     return Finding("duplicate poses", f"{many}", concern, figures={"count": many})
 
 

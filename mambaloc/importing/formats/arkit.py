@@ -67,7 +67,7 @@ def read_record3d(source: Path) -> Capture:
         raise InputError(f"{path}: all {len(rows)} poses are the same; record with the LiDAR camera, which is tracked")
     quaternion = np.roll(rows[:, :4], 1, axis=1)
     checked = from_quaternions(rows[:, 4:], quaternion, lambda row: f"{path}: poses, row {row}")
-    world_from_cam = checked.poses @ OPENCV_FROM_OPENGL
+    checked @= OPENCV_FROM_OPENGL
     folder = first_with_pictures([source / "rgbd", source / "rgb"])
     images = pictures(folder)
     numbered = {number_of(image): image for image in images}
@@ -79,12 +79,7 @@ def read_record3d(source: Path) -> Capture:
     return build_capture(
         "record3d",
         source,
-        [
-            Posed(
-                numbered[row], sequence, world_from_cam[row], names[row], times[row], fault=checked.faults.get(row, "")
-            )
-            for row in present
-        ],
+        [Posed(numbered[row], sequence, checked[row], names[row], times[row]) for row in present],
         unit="metre",
         choices={**_CHOICES, **checked.choices},
         cameras=cameras,
@@ -112,17 +107,16 @@ def read_polycam(source: Path) -> Capture:
     sequence, present = folder_name(source), [file for file in files if file.stem in images]
     read = [_polycam_frame(file, images[file.stem]) for file in present]
     matrices = np.array([matrix for matrix, _ in read]).reshape(-1, 3, 4)
-    checked = validate_se3(matrices, lambda row: str(present[row]))
+    checked = validate_se3(matrices, lambda row: str(present[row])) @ OPENCV_FROM_OPENGL
     names, cameras = told_apart([camera for _, camera in read])
     stamps = all(number_of(file) >= 0 for file in present)
     posed = [
         Posed(
             images[file.stem],
             sequence,
-            checked.poses[row] @ OPENCV_FROM_OPENGL,
+            checked[row],
             names[row],
             number_of(file) / 1e6 if stamps else None,
-            fault=checked.faults.get(row, ""),
         )
         for row, file in enumerate(present)
     ]

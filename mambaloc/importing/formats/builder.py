@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,26 +25,30 @@ _NONE_LISTED = "a split of its own that names none of the frames that have a pos
 
 
 @dataclass(frozen=True)
-class Posed:
-    """One image and what a format says of it; the fields are those of :class:`Capture`.
+class Pose:
+    """A pose (4, 4) as a format has it, and why its image is left out; empty where it is not."""
 
-    An image whose pose has a ``fault`` is left out for that.
-    """
+    world_from_cam: Matrices
+    fault: str = ""
+
+
+@dataclass(frozen=True)
+class Posed:
+    """One image and what a format says of it; the fields are those of :class:`Capture`."""
 
     image: Path
     sequence: str
-    world_from_cam: Matrices
+    pose: Pose
     camera: str | None = None
     time_s: float | None = None
     split: str | None = None
     depth: Path | None = None
     confidence: Path | None = None
-    fault: str = ""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """Poses that a file has, checked.
+    """Poses that a file has, checked: ``checked[row]``, ``checked @ matrix`` and ``checked.inverse()``.
 
     Args:
         poses: (N, 4, 4); NaN where a pose is a mark of no fix or is left out.
@@ -55,6 +59,16 @@ class Checked:
     poses: Matrices
     faults: Mapping[int, str]
     choices: Mapping[str, str]
+
+    def __getitem__(self, row: int) -> Pose:
+        return Pose(self.poses[row], self.faults.get(row, ""))
+
+    def __matmul__(self, matrix: Matrices) -> Checked:
+        return replace(self, poses=self.poses @ matrix)
+
+    def inverse(self) -> Checked:
+        """The transforms the other way; NaN stays NaN."""
+        return replace(self, poses=np.linalg.inv(self.poses).astype(np.float64))
 
 
 def build_capture(
@@ -70,6 +84,7 @@ def build_capture(
     left_out: Mapping[Path, str] | None = None,
     depth_camera: Matrices | None = None,
     split_concern: str = "",
+    metres_per_unit: float | None = None,
 ) -> Capture:
     """Make a capture: sequence after sequence, in the order of their first images.
 
@@ -77,7 +92,7 @@ def build_capture(
         kind: the format.
         source: for messages.
         posed: images, all there, each sequence in order.
-        unit: of positions.
+        unit: of positions, unless the source says it.
         choices: what was decided, by name.
         cameras: by name.
         missing: images that the format names and that are not there.
@@ -85,12 +100,13 @@ def build_capture(
         left_out: why images are left out that the format marks as bad.
         depth_camera: (3, 3), in pixels of depth frames, which are in millimetres.
         split_concern: as of :class:`Capture`.
+        metres_per_unit: likewise.
 
     Raises:
         InputError: for no image, one with two poses, or more than a scene may have.
     """
-    marked = {**(left_out or {}), **{each.image: each.fault for each in posed if each.fault}}
-    if marked and all(each.fault for each in posed):
+    marked = {**(left_out or {}), **{each.image: each.pose.fault for each in posed if each.pose.fault}}
+    if marked and all(each.pose.fault for each in posed):
         image, rule = next(iter(marked.items()))
         raise InputError(
             f"{source}: all {len(marked)} images with a pose are left out, such as {image.name}: {rule}; correct them"
@@ -105,7 +121,7 @@ def build_capture(
         if each.image in used:
             raise InputError(f"{source}: gives {each.image} more than one pose; remove all but one")
         used.add(each.image)
-    posed = [each for each in posed if not each.fault]
+    posed = [each for each in posed if not each.pose.fault]
     known = {*used, *marked}
     rank = {name: at for at, name in enumerate(dict.fromkeys(each.sequence for each in posed))}
     ordered = sorted(posed, key=lambda each: rank[each.sequence])
@@ -117,8 +133,9 @@ def build_capture(
         kind=kind,
         images=tuple(each.image for each in ordered),
         sequences=tuple(each.sequence for each in ordered),
-        world_from_cam=np.stack([each.world_from_cam for each in ordered]),
-        unit=unit,
+        world_from_cam=np.stack([each.pose.world_from_cam for each in ordered]),
+        unit=unit if metres_per_unit is None else "metre" if metres_per_unit == 1 else "unknown",
+        metres_per_unit=metres_per_unit,
         choices=dict(choices),
         cameras=dict(cameras or {}),
         camera_of=tuple(cameras_of) if len(cameras_of) == len(ordered) else None,

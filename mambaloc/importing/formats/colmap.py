@@ -67,13 +67,13 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
         np.roll([each.rotation.quat for each in cam_from_world], 1, axis=1),
         lambda row: f"{path}, image {placed[row].name[:80]!r}",
     )
-    world_from_cam = np.linalg.inv(checked.poses)
+    world_from_cam = checked.inverse()
     cameras = {f"camera-{number}": _camera(model.cameras[number], path) for number in _used(placed)}
     posed, missing = [], []
-    for row, (image, file, pose) in enumerate(zip(placed, found.files, world_from_cam, strict=True)):
+    for row, (image, file) in enumerate(zip(placed, found.files, strict=True)):
         if file not in found.missing:
-            camera, fault = f"camera-{image.camera_id}", checked.faults.get(row, "")
-            posed.append(Posed(file, _sequence(image.name, source), pose, camera, fault=fault))
+            sequence, camera = _sequence(image.name, source), f"camera-{image.camera_id}"
+            posed.append(Posed(file, sequence, world_from_cam[row], camera))
         else:
             missing.append(image.name)
     choices = {

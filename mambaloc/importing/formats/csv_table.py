@@ -2,7 +2,8 @@
 
 ``scene,split,seq,img_path,t1,t2,t3,q1,q2,q3,q4`` is TransPoseNet's (Shavit et al. 2021,
 ``datasets/CameraPoseDataset.py`` of github.com/yolish/transposenet), ``scene,split,image,x,y,z,qw,qx,qy,qz`` this
-project's; ``tx,ty,tz`` and a ``time`` are understood, too. The position is the camera centre, in metres in these two
+project's; ``tx,ty,tz``, a ``time`` and names with units are understood, too
+(:mod:`~mambaloc.importing.formats.column_names`). The position is the camera centre, in metres in these two
 and an unknown unit in any other. The quaternion is what a dataset's own labels hold: in both tables of 7-Scenes
 camera-to-world, of Cambridge Landmarks **world-to-camera**, and no column says which. So it is taken as
 camera-to-world, unless a row is of a Cambridge scene: then the format must be named, ``csv_world_from_cam`` or
@@ -13,7 +14,6 @@ without a column of images has a time, by which its rows are associated with pic
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -24,6 +24,7 @@ from mambaloc.errors import InputError
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
+from mambaloc.importing.formats.column_names import scale_of
 from mambaloc.importing.formats.finding import Found, count_there, find_pictures
 from mambaloc.importing.formats.parsing import (
     as_numbers,
@@ -33,31 +34,14 @@ from mambaloc.importing.formats.parsing import (
     read_text,
 )
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS
+from mambaloc.importing.formats.table_columns import POSITIONS, TableColumns, columns_of
 from mambaloc.importing.formats.timing import pair, stamps_of
 
 Direction = Literal["world_from_cam", "cam_from_world"]
 
-_IMAGE = ("image", "img_path", "image_path", "path", "file", "filename", "file_name", "image_name", "name")
-_POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("t1", "t2", "t3"))
-_QUATERNIONS = (("qw", "qx", "qy", "qz"), ("q1", "q2", "q3", "q4"))
-_TRANSPOSENET = (_POSITIONS[2], _QUATERNIONS[1])
-_SEQUENCE = ("seq", "sequence")
-_TIME = ("time", "time_s", "timestamp", "timestamp [ns]", "timestamp_ns", "time_ns", "stamp")
 _SPLITS = {"train": "train", "training": "train", "test": "test", "val": "val", "valid": "val", "validation": "val"}
 _NO_FIX = ("", "null", "none", "na", "n/a", "-")
 _CAMBRIDGE = ("KingsCollege", "OldHospital", "ShopFacade", "StMarysChurch", "GreatCourt", "Street")
-
-
-@dataclass(frozen=True)
-class _Columns:
-    """Which column holds what."""
-
-    image: str | None
-    position: tuple[str, ...]
-    quaternion: tuple[str, ...]
-    sequence: str | None
-    time: str | None
-
 
 Row = tuple[int, dict[str, str]]
 
@@ -103,18 +87,18 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
         Posed(
             image,
             sequence,
-            checked.poses[row],
+            checked[row],
             time_s=time_s,
             split=_split(path, *rows[row]),
-            fault=checked.faults.get(row, ""),
         )
         for image, sequence, row, time_s in pictured.frames
     ]
-    is_known = columns.position == _POSITIONS[2] or (columns.position == _POSITIONS[0] and "scene" in rows[0][1])
+    is_known = columns.position == POSITIONS[2] or (columns.position == POSITIONS[0] and "scene" in rows[0][1])
+    known = "metres, as the datasets have them" if is_known else "unknown: the table does not tell"
     choices = {
         "axes": "OpenCV camera axes, as the datasets have them",
         "direction": "world-to-camera, as --format says" if direction == "cam_from_world" else "camera-to-world",
-        "scale": "metres, as the datasets have them" if is_known else "unknown: the table does not tell",
+        "scale": scale_of(columns.metres_per_unit, known),
         "origin": "kept",
         "association": pictured.how,
         **checked.choices,
@@ -123,7 +107,16 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
     missing = pictured.missing
     kind = "csv" if direction is None else f"csv_{direction}"
     unit: Unit = "metre" if is_known else "unknown"
-    return build_capture(kind, path, posed, unit=unit, choices=choices, missing=missing, beside=beside)
+    return build_capture(
+        kind,
+        path,
+        posed,
+        unit=unit,
+        choices=choices,
+        missing=missing,
+        beside=beside,
+        metres_per_unit=columns.metres_per_unit,
+    )
 
 
 def _table(source: Path) -> Path:
@@ -136,14 +129,15 @@ def _table(source: Path) -> Path:
     return tables[0]
 
 
-def _rows(path: Path) -> tuple[_Columns, list[Row]]:
+def _rows(path: Path) -> tuple[TableColumns, list[Row]]:
     """The columns, and each row with its line."""
     text = read_text(path, "a table of poses with its columns' names in the first line")
     header = text.partition("\n")[0]
-    reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=header.count))
+    delimiter = max(",;\t", key=header.count)
+    reader = csv.reader(text.splitlines(), delimiter=delimiter)
     try:
-        names = [name.strip().lower().lstrip("# ") for name in next(reader, [])]
-        columns = _columns(path, names)
+        columns = columns_of(path, next(reader, []))
+        names = columns.names
         rows = []
         for values in reader:
             if len(values) != len(names) and values:
@@ -157,39 +151,17 @@ def _rows(path: Path) -> tuple[_Columns, list[Row]]:
         raise InputError(f"{path}, line {reader.line_num}: is no CSV ({error}); export it again") from None
     if not rows:
         raise InputError(f"{path}: has no row below its columns' names; add them")
-    return columns, rows
+    return columns, rows if delimiter == "," else _with_points(rows, columns)
 
 
-def _columns(path: Path, names: Sequence[str]) -> _Columns:
-    def the_one(what: str, sets: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-        found = [each for each in sets if set(each) <= set(names)]
-        if len(found) != 1:
-            wanted = " or ".join(",".join(each) for each in sets)
-            raise InputError(
-                f"{path}, line 1: must name the {what} once ({wanted}); it names {','.join(names)[:200]!r}"
-            )
-        return found[0]
-
-    def at_most_one(what: str, known: Sequence[str]) -> str | None:
-        found = [name for name in known if name in names]
-        return the_one(what, [(name,) for name in known])[0] if found else None
-
-    twice = next((name for name in names if name and names.count(name) > 1), None)
-    if twice:
-        raise InputError(f"{path}, line 1: names the column {twice[:40]!r} twice; remove one")
-    time, image = at_most_one("time", _TIME), at_most_one("image file", _IMAGE)
-    if image is None and time is None:
-        the_one("image file", [(name,) for name in _IMAGE])
-    columns = _Columns(
-        image=image,
-        position=the_one("position", _POSITIONS),
-        quaternion=the_one("quaternion", _QUATERNIONS),
-        sequence=at_most_one("sequence", _SEQUENCE),
-        time=time,
-    )
-    if columns.quaternion == _QUATERNIONS[1] and (columns.position, columns.quaternion) != _TRANSPOSENET:
-        raise InputError(f"{path}, line 1: q1,q2,q3,q4 do not say which is the scalar; name them qw,qx,qy,qz")
-    return columns
+def _with_points(rows: list[Row], columns: TableColumns) -> list[Row]:
+    """Rows whose numbers have points, where no number of the poses has one, but commas, as spreadsheets write them."""
+    names = (*columns.position, *columns.quaternion)
+    words = [row[name] for _, row in rows for name in names]
+    if any("." in word for word in words) or not any("," in word for word in words):
+        return rows
+    names += () if columns.time is None else (columns.time,)
+    return [(line, {**row, **{name: row[name].replace(",", ".") for name in names}}) for line, row in rows]
 
 
 def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
@@ -206,7 +178,7 @@ def _of_one_scene(source: Path, path: Path, rows: list[Row]) -> list[Row]:
     return chosen
 
 
-def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction: Direction | None) -> None:
+def _refuse_cambridge(path: Path, rows: list[Row], columns: TableColumns, direction: Direction | None) -> None:
     for line, row in rows:
         first = row.get(columns.image or "", "").replace("\\", "/").partition("/")[0]
         if direction is None and any(name in (row.get("scene"), first) for name in _CAMBRIDGE):
@@ -216,7 +188,7 @@ def _refuse_cambridge(path: Path, rows: list[Row], columns: _Columns, direction:
             )
 
 
-def _numbers(path: Path, line: int, row: dict[str, str], columns: _Columns) -> np.ndarray:
+def _numbers(path: Path, line: int, row: dict[str, str], columns: TableColumns) -> np.ndarray:
     words = [row[name] for name in (*columns.position, *columns.quaternion)]
     values = as_numbers(["nan" if word.lower() in _NO_FIX else word for word in words])
     if values is None:
@@ -229,12 +201,12 @@ def _turned(quaternion: np.ndarray, direction: Direction | None) -> np.ndarray:
     return quaternion * (1, -1, -1, -1) if direction == "cam_from_world" else quaternion
 
 
-def _by_image(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> _Pictured:
+def _by_image(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> _Pictured:
     folder, found = _images(path, rows, columns, given)
     images, how = found.files, "; ".join(filter(None, ("by name", found.elsewhere)))
     stamps = None
     if columns.time is not None:
-        stamps = stamps_of([row[columns.time] for _, row in rows])
+        stamps = stamps_of([row[columns.time] for _, row in rows], said=columns.time_unit)
         if stamps is None:
             line, row = next(((line, row) for line, row in rows if stamps_of([row[columns.time]]) is None), rows[0])
             time = row[columns.time][:40]
@@ -249,7 +221,7 @@ def _by_image(path: Path, rows: list[Row], columns: _Columns, given: Path | None
     return _Pictured(frames, how if stamps is None else f"{how}; timed in {stamps.unit}", missing)
 
 
-def _by_time(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> _Pictured:
+def _by_time(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> _Pictured:
     images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, [row[str(columns.time)] for _, row in rows], path)
     name = folder_name(path.parent)
@@ -257,7 +229,7 @@ def _by_time(path: Path, rows: list[Row], columns: _Columns, given: Path | None)
     return _Pictured(sorted(frames, key=lambda frame: frame[3] or 0.0), pairing.how, pairing.missing)
 
 
-def _images(path: Path, rows: list[Row], columns: _Columns, given: Path | None) -> tuple[Path, Found]:
+def _images(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> tuple[Path, Found]:
     """The folder that the table's names are relative to, and each row's file there."""
     names = [(row[str(columns.image)], row.get("scene", ""), f"{path}, line {line}") for line, row in rows]
     whole = [(name, where) for name, _, where in names]

@@ -81,15 +81,15 @@ def read_euroc(source: Path, images: Path | None = None) -> Capture:
     pairs, how = by_time(listing, stamps, table.words, table.path)
     checked = from_quaternions(table.numbers[:, :3], table.numbers[:, 3:], table.where)
     sensor_from_cam = np.linalg.inv(_body_from_sensor(truth / "sensor.yaml")) @ body_from_cam
+    posed_cam = checked @ sensor_from_cam
     name = folder_name(folder.parent if source == folder else source)
     posed = [
         Posed(
             found.files[there[at]],
             name,
-            checked.poses[row] @ sensor_from_cam,
+            posed_cam[row],
             "cam0",
             float(stamps.seconds[at]),
-            fault=checked.faults.get(row, ""),
         )
         for at, row in pairs
     ]

@@ -10,8 +10,9 @@ import os
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -69,7 +70,8 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
     direct = [path_inside(root, name) if isinstance(name, str) else None for name, _ in named]
     files = [None if path is None else _there(root, path) for path in direct]
     lost = [row for row, file in enumerate(files) if file is None]
-    moved = _by_tails(root, [named[row] for row in lost], {file for file in files if file}, named) if lost else []
+    tails = _Tails(root)
+    moved = _by_tails(tails, [named[row] for row in lost], {file for file in files if file}, named) if lost else []
     for row, file in zip(lost, moved, strict=True):
         files[row] = file
     outside = [row for row in lost if direct[row] is None]
@@ -80,7 +82,7 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
             f"end. {_GIVE}"
         )
     if not any(files):
-        others = next(iter(_Tails(root).known.values()), None)
+        others = next(iter(tails.known.values()), None)
         there = f", while {'/'.join(others[0])!r} is there" if others else ""
         raise InputError(
             f"{root}: has no image with a pose; {len(named)} are named and missing, such as {named[0][0][-60:]!r}"
@@ -101,7 +103,7 @@ def count_there(folder: Path, names: Sequence[str]) -> int:
 
 
 def _by_tails(
-    root: Path, lost: Sequence[tuple[Any, str]], taken: set[Path], named: Sequence[tuple[Any, str]]
+    tails: _Tails, lost: Sequence[tuple[Any, str]], taken: set[Path], named: Sequence[tuple[Any, str]]
 ) -> list[Path | None]:
     """The picture of each path that is not where it says, if one below the root has its end and no other path.
 
@@ -109,11 +111,12 @@ def _by_tails(
         InputError: for a path that no file has, or that may mean two pictures.
     """
     for name, where in lost:
-        if not isinstance(name, str) or not _is_possible(root, name):
+        if not isinstance(name, str) or not _is_possible(tails.root, name):
             raise InputError(
-                f"{where}: names {str(name)[:60]!r}, which is no file inside of {root}; write the picture's path there"
+                f"{where}: names {str(name)[:60]!r}, which is no file inside of {tails.root}; write the picture's path "
+                "there"
             )
-    tails, least = _Tails(root), 1 if len({path_parts(name)[:-1] for name, _ in named}) == 1 else 2
+    least = 1 if len({path_parts(name)[:-1] for name, _ in named}) == 1 else 2
     found = [tails.find(path_parts(name), least, name, where) for name, where in lost]
     return [None if file in taken else file for file in found]
 
@@ -173,20 +176,25 @@ def _has_suffix(name: str) -> bool:
 
 
 class _Tails:
-    """The pictures below a folder, by their names without suffix."""
+    """The pictures below a folder, which is walked once, when they are asked for."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.known: dict[str, list[Parts]] = defaultdict(list)
-        inside = root.resolve()
-        for at, (folder, folders, names) in enumerate(os.walk(root)):
+
+    @cached_property
+    def known(self) -> Mapping[str, list[Parts]]:
+        """Their paths, by their names without suffix."""
+        known: dict[str, list[Parts]] = defaultdict(list)
+        inside = self.root.resolve()
+        for at, (folder, folders, names) in enumerate(os.walk(self.root)):
             folders[:] = sorted(name for name in folders if not name.startswith("."))
-            if at + len(self.known) > _MOST_FILES:
-                raise InputError(f"{root}: has more than {_MOST_FILES} files and folders below. {_GIVE}")
+            if at + len(known) > _MOST_FILES:
+                raise InputError(f"{self.root}: has more than {_MOST_FILES} files and folders below. {_GIVE}")
             for name in names:
                 file = Path(folder, name)
                 if file.suffix.lower() in PICTURES and (not file.is_symlink() or file.resolve().is_relative_to(inside)):
-                    self.known[_folded(file.stem)].append(file.relative_to(root).parts)
+                    known[_folded(file.stem)].append(file.relative_to(self.root).parts)
+        return known
 
     def find(self, parts: Parts, least: int, name: str, where: str) -> Path | None:
         """The picture with the longest common end, of so many parts at least.

@@ -88,9 +88,10 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
             beside.append(file)
             if record.row is None:
                 continue
-            pose = np.linalg.inv(record.sensor_from_device @ checked.poses[record.row])
-            fault = checked.faults.get(record.row, "")
-            told = Posed(file, _sequence(file, root), pose, split=record.split, fault=fault)
+            device = checked[record.row]
+            world_from_cam = np.linalg.inv(record.sensor_from_device @ device.world_from_cam).astype(np.float64)
+            pose = replace(device, world_from_cam=world_from_cam)
+            told = Posed(file, _sequence(file, root), pose, split=record.split)
             frames.append((record.key, told, _told(sensors, record)))
         choices |= {**found.choices, **checked.choices}
     if len({key for key, _, _ in frames}) == len(frames):  # parts of one recording; others may count alike

@@ -56,14 +56,14 @@ def read_kitti(source: Path) -> Capture:
     folder = first_with_pictures([sequence / "image_2", sequence / "image_0"])
     images = pictures(folder)
     camera, cam0_from_cam = _camera(sequence / "calib.txt", folder.name, images[0])
+    world_from_cam = checked @ cam0_from_cam
     times = _times(sequence / "times.txt", len(checked.poses))
     numbered = {number_of(image): image for image in images}
     posed, missing = [], []
-    for row, world_from_cam0 in enumerate(checked.poses):
+    for row in range(len(checked.poses)):
         if row in numbered:
-            pose = world_from_cam0 @ cam0_from_cam
-            time_s, fault = None if times is None else times[row], checked.faults.get(row, "")
-            posed.append(Posed(numbered[row], sequence.name, pose, folder.name, time_s, fault=fault))
+            time_s = None if times is None else times[row]
+            posed.append(Posed(numbered[row], sequence.name, world_from_cam[row], folder.name, time_s))
         else:
             missing.append(f"{folder.name}/{row:06d}{images[0].suffix}")
     moved = f"poses of camera 0, moved {np.linalg.norm(cam0_from_cam[:3, 3]) * 100:.1f} cm to {folder.name}'s"

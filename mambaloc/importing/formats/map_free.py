@@ -55,7 +55,7 @@ def read_map_free(source: Path, images: Path | None = None) -> Capture:
     """
     table = read_table(source / _POSES, 7, _ROW, named=True, may_lack_fix=True)
     checked = from_quaternions(table.numbers[:, 4:], table.numbers[:, :4], table.where)
-    world_from_cam = np.linalg.inv(checked.poses)
+    world_from_cam = checked.inverse()
     root = source if images is None else images
     found = find_pictures(root, [(name, table.where(row)) for row, name in enumerate(table.words)])
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
@@ -69,7 +69,6 @@ def read_map_free(source: Path, images: Path | None = None) -> Capture:
             _sequence(found.files[row], root),
             world_from_cam[row],
             camera,
-            fault=checked.faults.get(row, ""),
         )
         for row, camera in zip(there, camera_of, strict=True)
     ]

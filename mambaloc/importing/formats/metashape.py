@@ -66,8 +66,8 @@ def read_metashape(source: Path, images: Path | None = None) -> Capture:
     transform = chunk.find("transform") if transform is None else transform
     poses, malformed = _to_chunk(path, cameras)
     checked = validate_se3(poses, lambda row: f"{path}: camera {labels[row][:60]!r}")
-    faults = {**malformed, **checked.faults}
-    world_from_cam = checked.poses if transform is None else _to_world(path, transform, checked.poses)
+    world = checked.poses if transform is None else _to_world(path, transform, checked.poses)
+    checked = replace(checked, poses=world, faults={**malformed, **checked.faults})
     enabled = [row for row in there if cameras[row].get("enabled", "true").lower() not in _NO]
     lenses = {f"sensor-{number}": _sensor(path, chunk, number) for number in _used(cameras, enabled)}
     is_metric = transform is not None and _has_references(chunk)
@@ -78,9 +78,8 @@ def read_metashape(source: Path, images: Path | None = None) -> Capture:
             Posed(
                 found.files[row],
                 _sequence(found.files[row], folder),
-                world_from_cam[row],
+                checked[row],
                 f"sensor-{cameras[row].get('sensor_id')}",
-                fault=faults.get(row, ""),
             )
             for row in enabled
         ],

@@ -1,7 +1,9 @@
 """``transforms.json`` of nerfstudio and instant-ngp, and NeRF's ``transforms_train.json`` with its companions.
 
-Each frame has a camera-to-world matrix in OpenGL's camera axes: x right, y up, z back. ScanNet++ has ``test_frames``
-beside ``frames``, and marks frames that are blurred or in shadow ``is_bad`` (github.com/scannetpp/scannetpp).
+Each frame has a camera-to-world matrix in OpenGL's camera axes: x right, y up, z back. Its numbers come in rows or in
+one list, and column after column where only that gives rotations, as WebGL and ARKit have them. ScanNet++ has
+``test_frames`` beside ``frames``, and marks frames that are blurred or in shadow ``is_bad``
+(github.com/scannetpp/scannetpp).
 """
 
 from __future__ import annotations
@@ -16,11 +18,12 @@ import numpy as np
 from mambaloc.data.frames import ROTATION_TOLERANCE
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
-from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, validate_se3
+from mambaloc.importing.formats.builder import Matrices, Pose, Posed, build_capture, validate_se3
 from mambaloc.importing.formats.finding import find_pictures
 from mambaloc.importing.formats.listed_splits import given_split
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
 from mambaloc.importing.formats.parsing import pictures_beside, read_object
+from mambaloc.importing.formats.pose_rows import is_by_column, matrices_of
 from mambaloc.runtime.rotations import is_rotation
 from mambaloc.text import natural
 
@@ -36,6 +39,7 @@ _LISTS = tuple(f"{split}_filenames" for split in ("train", "val", "test"))
 _READ = {"frames", "test_frames", "applied_transform", "applied_scale", *_LISTS, *KEYS}
 _READ_OF_FRAMES = {"file_path", "transform_matrix", "is_bad", *KEYS}
 _NAMED = 12  # keys that are not read
+_LOOKED_AT = 200  # matrices
 _BAD = "marked is_bad by the capture"
 
 
@@ -92,7 +96,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         [frame.intrinsics for _, frame in good], [image for image, _ in good], files[0]
     )
     posed = [
-        Posed(image, _sequence(image, folder), frame.world_from_cam, name, split=frame.split, fault=frame.fault)
+        Posed(image, _sequence(image, folder), Pose(frame.world_from_cam, frame.fault), name, split=frame.split)
         for (image, frame), name in zip(good, names, strict=True)
     ]
     choices = _choices(files[0].name, contents[files[0]], [file.name for file in files if file not in contents])
@@ -124,16 +128,17 @@ def _content(file: Path) -> dict[str, Any]:
 def _frames(file: Path, content: dict[str, Any]) -> Iterator[_Frame]:
     """Each frame with its intrinsics: its own, and the file's where it has none."""
     original_from_file, scale = _original_from_file(file, content)
+    by_column = _is_by_column(content)
     shared = {key: content[key] for key in KEYS if key in content}
     test = content.get("test_frames") or []
-    for count, frame in enumerate((*content["frames"], *test), start=1):
+    for count, frame in enumerate(_all_frames(content), start=1):
         is_test = count > len(content["frames"])
         where = f"{file}, test frame {count - len(content['frames'])}" if is_test else f"{file}, frame {count}"
         rows = frame.get("transform_matrix")
         world_from_cam, fault = np.full((4, 4), np.nan), ""  # a tracker's frame without a pose
         try:
             if rows is not None:
-                world_from_cam = _matrix(rows, f"{where}: transform_matrix") @ OPENCV_FROM_OPENGL
+                world_from_cam = _matrix(rows, f"{where}: transform_matrix", by_column) @ OPENCV_FROM_OPENGL
         except ValueError as error:
             fault = str(error)
         world_from_cam[:3, 3] /= scale
@@ -198,11 +203,12 @@ def _choices(file: str, content: dict[str, Any], other_files: Sequence[str]) -> 
     choices = {
         "axes": "OpenGL's (x right, y up, z back), turned to OpenCV's: the cameras' y and z axes are negated",
         "direction": f"camera to world, as {file} has it",
+        **_how_written(content),
         "world": world if undone else f"that of {file}",
         "scale": "the format does not tell its unit",
         "order": "by file name, its numbers as numbers, since the format tells no time; a folder is a sequence",
     }
-    of_frames = {key for frame in (*content["frames"], *(content.get("test_frames") or [])) for key in frame}
+    of_frames = {key for frame in _all_frames(content) for key in frame}
     unread = [
         *other_files,
         *sorted(content.keys() - _READ),
@@ -213,18 +219,47 @@ def _choices(file: str, content: dict[str, Any], other_files: Sequence[str]) -> 
     return choices
 
 
-def _matrix(rows: Any, where: str) -> Matrices:
-    """A 4x4 or 3x4 matrix as (4, 4); NaN and infinity are kept.
+def _all_frames(content: dict[str, Any]) -> list[dict[str, Any]]:
+    return [*content["frames"], *(content.get("test_frames") or [])]
+
+
+def _is_by_column(content: dict[str, Any]) -> bool:
+    """Whether the matrices are rotations and shifts only if they are written column after column."""
+    frames = _all_frames(content)
+    some = (_numbers(frame.get("transform_matrix")) for frame in frames[:: 1 + len(frames) // _LOOKED_AT])
+    matrices = [each for each in some if each is not None]
+    usual = [each for each in matrices if len(each) == max(map(len, matrices))]
+    return bool(usual) and is_by_column(np.array(usual)) is True
+
+
+def _how_written(content: dict[str, Any]) -> dict[str, str]:
+    """What was decided of matrices that are not written in rows."""
+    matrices = (frame.get("transform_matrix") for frame in _all_frames(content))
+    in_one_list = sum(isinstance(each, list) and len(each) in (12, 16) for each in matrices)
+    said = [f"{in_one_list} in one list of numbers"] if in_one_list else []
+    said += ["written column after column: only so are they rotations"] if _is_by_column(content) else []
+    return {"matrices": "; ".join(said)} if said else {}
+
+
+def _numbers(matrix: Any) -> Matrices | None:
+    """The 16 or 12 numbers of a 4x4 or 3x4 matrix, in rows or in one list; None where it is anything else."""
+    try:
+        numbers = np.array([[float(each) for each in row] if isinstance(row, list) else float(row) for row in matrix])
+    except (ValueError, TypeError, OverflowError):
+        return None
+    return numbers.ravel() if numbers.shape in ((4, 4), (3, 4), (16,), (12,)) else None
+
+
+def _matrix(value: Any, where: str, by_column: bool = False) -> Matrices:
+    """A matrix as (4, 4); NaN and infinity are kept.
 
     Raises:
-        ValueError: for anything else.
+        ValueError: for anything else than a 4x4 or 3x4 matrix.
     """
-    try:
-        matrix = np.array([[float(each) for each in row] for row in rows])
-    except (ValueError, TypeError, OverflowError):
-        matrix = np.empty(0)
-    if matrix.shape not in ((4, 4), (3, 4)):
+    numbers = _numbers(value)
+    if numbers is None:
         raise ValueError(f"{where} is no 4x4 or 3x4 matrix of numbers")
+    (matrix,) = matrices_of(numbers[None], by_column)
     if np.isfinite(matrix[3:]).all() and not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
         raise ValueError(f"{where}'s last row is not 0 0 0 1")
     return np.concatenate((matrix[:3], [[0.0, 0.0, 0.0, 1.0]]))

@@ -82,7 +82,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
         raise InputError(f"{source}: has no picture with a pose file beside it, as X.jpg with X.txt. {_TABLE}")
     files = [file for group in groups for _, file in group.pairs]
     checked, by_column = _read_matrices(files)
-    poses = towards_world(checked.poses, direction)
+    checked = towards_world(checked, direction)
     is_layout = all(file.name.endswith(".pose.txt") for file in files)
     images = [(group.name, image) for group in groups for image, _ in group.pairs]
     names, cameras, said = _cameras(source, [image for _, image in images], is_layout)
@@ -91,13 +91,12 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
         Posed(
             image,
             name,
-            pose,
+            checked[row],
             camera,
             split=_split(name),
             depth=each,
-            fault=checked.faults.get(row, ""),
         )
-        for row, ((name, image), pose, camera, each) in enumerate(zip(images, poses, names, depth, strict=True))
+        for row, ((name, image), camera, each) in enumerate(zip(images, names, depth, strict=True))
     ]
     told = {**({"written": "column after column"} if by_column else {}), **({"cameras": said} if said else {})}
     unit = "metres, as 7-Scenes has them" if is_layout else "unknown: pose files do not tell"

@@ -66,8 +66,8 @@ def read_scannet(source: Path) -> Capture:
     name = folder_name(source)
     camera_name = None if camera is None else "color"
     posed = [
-        Posed(images[file.stem], name, pose, camera_name, fault=checked.faults.get(row, ""))
-        for row, (file, pose) in enumerate(zip(tracked, checked.poses, strict=True))
+        Posed(images[file.stem], name, checked[row], camera_name)
+        for row, file in enumerate(tracked)
         if file.stem in images
     ]
     return build_capture(
@@ -104,10 +104,9 @@ def read_replica(source: Path) -> Capture:
     camera = _replica_camera(source)
     name = folder_name(source)
     posed, missing = [], []
-    for row, pose in enumerate(checked.poses):
+    for row in range(len(checked.poses)):
         if row in numbered:
-            camera_name, fault = None if camera is None else "frame", checked.faults.get(row, "")
-            posed.append(Posed(numbered[row], name, pose, camera_name, fault=fault))
+            posed.append(Posed(numbered[row], name, checked[row], None if camera is None else "frame"))
         else:
             missing.append(f"results/frame{row:06d}")
     cameras = {} if camera is None else {"frame": camera}

@@ -20,12 +20,12 @@ from mambaloc.images import PICTURES, pictures
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import (
     Checked,
-    Matrices,
     Posed,
     build_capture,
     from_quaternions,
     validate_se3,
 )
+from mambaloc.importing.formats.column_names import scale_of
 from mambaloc.importing.formats.finding import count_there, find_pictures
 from mambaloc.importing.formats.map_free import cameras_by_picture
 from mambaloc.importing.formats.parsing import Table, first_with_pictures, folder_name, only_file, pictures_beside
@@ -99,15 +99,12 @@ def read_in_order(
             "order, or write each picture's name before its pose"
         )
     checked = validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
-    poses = towards_world(checked.poses, direction)
+    checked = towards_world(checked, direction)
     sequence = folder_name(path.parent)
     return build_capture(
         kind,
         path.parent,
-        [
-            Posed(image, sequence, pose, fault=checked.faults.get(row, ""))
-            for row, (image, pose) in enumerate(zip(images, poses, strict=True))
-        ],
+        [Posed(image, sequence, checked[row]) for row, image in enumerate(images)],
         unit="unknown",
         choices={
             **choices,
@@ -135,7 +132,7 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None, given: 
         checked = validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
         told = {"direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD}
         told |= _by_column(layout)
-    world_from_cam = towards_world(checked.poses, direction)
+    checked = towards_world(checked, direction)
     rows, how, missing = _pictures_of(path, table, given)
     cameras = cameras_by_picture(path.parent / "intrinsics.txt")
     names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras.values()))}
@@ -144,19 +141,26 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None, given: 
         Posed(
             image,
             _sequence(image, given or path.parent),
-            world_from_cam[row],
+            checked[row],
             camera_of.get(table.words[row].replace("\\", "/")),
             time_s,
-            fault=checked.faults.get(row, ""),
         )
         for image, row, time_s in rows
     ]
+    length_m = layout.metres_per_unit(path) if layout.count == 7 else None
     return build_capture(
         "pose_lines",
         path,
         sorted(posed, key=lambda each: each.time_s or 0.0),
         unit="unknown",
-        choices={**_CHOICES, **told, "association": how, **checked.choices},
+        choices={
+            **_CHOICES,
+            **told,
+            "scale": scale_of(length_m, _CHOICES["scale"]),
+            "association": how,
+            **checked.choices,
+        },
+        metres_per_unit=length_m,
         cameras={name: camera for camera, name in names.items()},
         missing=missing,
         beside=pictures_beside(image for image, _, _ in rows),
@@ -184,9 +188,9 @@ def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tup
     return checked, direction, told
 
 
-def towards_world(poses: Matrices, direction: Direction) -> Matrices:
-    """``world_from_cam`` of transforms (N, 4, 4) of a direction; NaN stays NaN."""
-    return poses if direction == "world_from_cam" else np.linalg.inv(poses).astype(np.float64)
+def towards_world(checked: Checked, direction: Direction) -> Checked:
+    """``world_from_cam`` of transforms of a direction."""
+    return checked if direction == "world_from_cam" else checked.inverse()
 
 
 def _pictures_of(

@@ -17,6 +17,7 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.images import PICTURES, pictures
 from mambaloc.importing.formats.builder import LONGEST, SHORTEST, Matrices, is_mark
+from mambaloc.importing.formats.column_names import Column, columns_in, metres_per_unit
 from mambaloc.importing.formats.parsing import Table, as_numbers, read_text
 from mambaloc.runtime.rotations import is_rotation
 
@@ -43,7 +44,7 @@ class Layout:
         count: of numbers: 7, 12 or 16.
         by_column: whether a matrix is written column after column.
         quaternion: place of its first number of seven.
-        header: words of the line that names the columns, in lower case; empty where there is none.
+        header: the columns that a line above names, as many as there are; empty where there is none.
     """
 
     is_named: bool
@@ -51,40 +52,45 @@ class Layout:
     count: int
     by_column: bool = False
     quaternion: int = 3
-    header: tuple[str, ...] = ()
+    header: tuple[Column, ...] = ()
 
     @property
     def scalar(self) -> str | None:
         """Whether the header puts the quaternion's scalar ``first`` or ``last``; None where it does not say."""
-        at = [place for place, name in enumerate(self._of_quaternion) if name.endswith("w")]
+        at = [place for place, column in enumerate(self._of_quaternion) if column.name.endswith("w")]
         return {0: "first", 3: "last"}.get(at[0]) if len(at) == 1 else None
 
     @property
     def is_unclear(self) -> bool:
         """Whether a header names the columns, but not the quaternion's in a way that is known."""
-        of_position = self._columns[self._start :][:3] if self.quaternion else self._columns[self._start + 4 :]
-        named = len(of_position) == 3 and all(
-            name.endswith(axis) for name, axis in zip(of_position, "xyz", strict=True)
-        )
-        return named and self.scalar is None
+        return bool(self._of_position) and self.scalar is None
+
+    def metres_per_unit(self, path: Path) -> float | None:
+        """What the header of a file says of the positions' unit; None where it says nothing.
+
+        Raises:
+            InputError: for a unit that is no length, or several.
+        """
+        return metres_per_unit(self._of_position, f"{path}: its header")
 
     @property
     def _start(self) -> int:
         return int(self.is_named)
 
     @property
-    def _columns(self) -> tuple[str, ...]:
-        """The header's names of columns, without units in brackets; empty where there are not as many."""
-        names = tuple(word for word in self.header if not word.startswith(("[", "(")))
-        return names if len(names) == self.count + self._start else ()
+    def _of_quaternion(self) -> tuple[Column, ...]:
+        return self.header[self._start + self.quaternion :][:4]
 
     @property
-    def _of_quaternion(self) -> tuple[str, ...]:
-        return self._columns[self._start + self.quaternion :][:4]
+    def _of_position(self) -> tuple[Column, ...]:
+        """The columns of the position; empty where the header does not name them."""
+        columns = self.header[self._start + (0 if self.quaternion else 4) :][:3]
+        return columns if "".join(column.name[-1:] for column in columns) == "xyz" else ()
 
 
 def split_line(line: str) -> tuple[str, list[str]]:
-    """A line's leading word, and the words after it; a picture's name may hold spaces."""
+    """A line's leading word, and the words after it; a picture's name may hold spaces, and be in quotes."""
+    line = line.replace('"', "")
     named = _AFTER_PICTURE.fullmatch(line.strip())
     if named:
         return named[1], re.split(r"[\s,;]+", named[2].strip(" \t,;"))
@@ -100,17 +106,17 @@ def layout_of(path: Path) -> Layout | None:
         return None
     first, rest = lines[:_LOOKED_AT], lines[_LOOKED_AT:]  # trackers may have no pose for long
     said = [line.strip() for line in (*first, *rest[:: 1 + len(rest) // _LOOKED_AT]) if line.strip()]
-    header = next((line for line in reversed(said) if line.startswith("#")), "#").lstrip("#% ").lower()
+    headers = [columns_in(line.lstrip("#% ")) for line in said if line.startswith("#")]
     rows = [split_line(line) for line in said if not line.startswith("#")]
     start = next((at for at, (_, words) in enumerate(rows[: _HEADERS + 1]) if as_numbers(words[-7:]) is not None), None)
     if start is None or len(rows) - start < _LEAST_LINES:
         return None
     if start > 0:
-        header = " ".join((rows[start - 1][0], *rows[start - 1][1])).lower()
-    return _layout(rows[start:], tuple(re.split(r"[\s,;]+", header)))
+        headers.append(columns_in(" ".join((rows[start - 1][0], *rows[start - 1][1]))))
+    return _layout(rows[start:], headers)
 
 
-def _layout(rows: Sequence[tuple[str, list[str]]], header: tuple[str, ...]) -> Layout | None:
+def _layout(rows: Sequence[tuple[str, list[str]]], headers: Sequence[tuple[Column, ...]]) -> Layout | None:
     counts = [len(words) for _, words in rows]
     after = max(set(counts), key=counts.count)
     usual = [row for row in rows if len(row[1]) == after]
@@ -123,6 +129,7 @@ def _layout(rows: Sequence[tuple[str, list[str]]], header: tuple[str, ...]) -> L
     table = numbers.reshape(len(usual), count)
     if count == 7:
         place = _place_of_quaternion(table)
+        header = next((each for each in reversed(headers) if len(each) == count + is_named), ())
         return None if place is None else Layout(is_named, is_text, 7, quaternion=place, header=header)
     by_column = is_by_column(table)
     return None if by_column is None else Layout(is_named, is_text, count, by_column)

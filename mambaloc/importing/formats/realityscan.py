@@ -71,7 +71,7 @@ def read_realityscan(source: Path, images: Path | None = None) -> Capture:
     found = find_pictures(folder, [(name, f"{path}, line {line}") for line, name, _ in rows])
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     table = np.array([numbers for _, _, numbers in rows])
-    poses = validate_se3(_world_from_cam(table), lambda row: f"{path}, line {rows[row][0]}").poses
+    checked = validate_se3(_world_from_cam(table), lambda row: f"{path}, line {rows[row][0]}")
     told: dict[tuple[float, ...], str] = {}
     cameras: dict[str, Camera] = {}
     posed = []
@@ -80,7 +80,7 @@ def read_realityscan(source: Path, images: Path | None = None) -> Capture:
         name = told.setdefault(lens, f"camera-{len(told) + 1}")
         if name not in cameras:
             cameras[name] = _camera(size, lens[2:], f"{path}, line {rows[row][0]}")
-        posed.append(Posed(found.files[row], _sequence(found.files[row], folder), poses[row], name))
+        posed.append(Posed(found.files[row], _sequence(found.files[row], folder), checked[row], name))
     return build_capture(
         "realityscan",
         path,

@@ -28,7 +28,7 @@ from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import Image
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.film import digest_of
-from mambaloc.importing.formats.builder import Posed, build_capture, pinhole
+from mambaloc.importing.formats.builder import Pose, Posed, build_capture, pinhole
 from mambaloc.importing.formats.parsing import folder_name
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.importing.undistort.fitting import FittedCameras
@@ -87,7 +87,7 @@ def read_ros_bag(source: Path, topics: BagTopics | None = None) -> Capture:
     sequence = folder_name(source) if source.is_dir() else source.stem
     frames = sorted(zip(note["frames"], poses, strict=True), key=lambda frame: frame[0]["ns"])
     posed = [
-        Posed(folder / each["name"], sequence, pose, next(iter(cameras), None), each["ns"] / 1e9)
+        Posed(folder / each["name"], sequence, Pose(pose), next(iter(cameras), None), each["ns"] / 1e9)
         for each, pose in frames
     ]
     return build_capture(

@@ -16,7 +16,7 @@ from mambaloc.data.frames import BadFrames, Split
 from mambaloc.data.points.depth import depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.images import stored_size
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.formats.builder import Posed, build_capture, pinhole
+from mambaloc.importing.formats.builder import Pose, Posed, build_capture, pinhole
 from mambaloc.runtime.rotations import matrix_from_quaternion
 from mambaloc.text import natural
 
@@ -48,7 +48,7 @@ def read_seven_scenes(source: Path) -> Capture:
             pose[:3, :3], pose[:3, 3] = matrix_from_quaternion(frames.quaternion[row]), frames.position_m[row]
             depth = depth_path(image)
             depth_file = depth if depth.is_file() else None
-            posed.append(Posed(image, frames.sequences[row], pose, "colour", split=split, depth=depth_file))
+            posed.append(Posed(image, frames.sequences[row], Pose(pose), "colour", split=split, depth=depth_file))
     matrix = frame_intrinsics("7scenes", source, frames)[0]
     size = stored_size(posed[0].image)
     camera = pinhole(size, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), source)

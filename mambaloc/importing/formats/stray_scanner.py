@@ -69,12 +69,11 @@ def read_stray_scanner(source: Path) -> Capture:
         Posed(
             image,
             folder_name(source),
-            checked.poses[row],
+            checked[row],
             name,
             table.numbers[row, 0],
             depth=measured,
             confidence=sure,
-            fault=checked.faults.get(row, ""),
         )
         for image, row, name, measured, sure in zip(images, present, names, depth, confidence, strict=True)
     ]

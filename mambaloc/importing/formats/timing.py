@@ -1,7 +1,8 @@
 """Which pose is which picture's, where both are named by numbers: by equal names, or by the nearest time stamps.
 
 Time stamps are compared as whole nanoseconds: float64 is off by 128 of them at today's times. Their unit is found by
-their size. Times since 1970 are of one size in each unit; of others the median step tells.
+their size. Times since 1970 are of one size in each unit, so that a file may mix units; of others the median step
+tells.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ FARTHEST_S = 0.02
 """Time stamps that differ by more are not associated: the default of TUM's ``associate.py``."""
 
 UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+_PER_S = {unit: 10**9 // per_ns for unit, per_ns in UNITS_NS.items()}
 _SINCE_1970_S = (5 * 10**8, 5 * 10**9)  # from 1985 to 2128
 _LONGEST_STEP_S = 2  # from a frame to the next
 _LEAST_STEP_OF_WHOLE = 2000  # frames are numbered in smaller steps
@@ -38,7 +40,7 @@ class Stamps:
 
     Args:
         ns: (N,) int64, nanoseconds.
-        unit: in which they were written.
+        unit: in which they were written; several where each of them tells its own.
     """
 
     ns: NDArray[np.int64]
@@ -55,21 +57,29 @@ class Stamps:
         return f"{self.ns.min() / 1e9:.2f} to {self.ns.max() / 1e9:.2f} s, read as {self.unit}"
 
 
-def stamps_of(words: Sequence[str], like: Stamps | None = None) -> Stamps | None:
+def stamps_of(words: Sequence[str], like: Stamps | None = None, said: str = "") -> Stamps | None:
     """Times of words, in the unit that their size tells; None where one is no number.
 
     Args:
         words: as they were written.
         like: other times of the same recording: of units that could be, the one in which both overlap most.
+        said: the unit that a file says they are in; taken where their size allows it.
     """
     numbers = [number for word in words if (number := _number(word)) is not None]
     if not numbers or len(numbers) < len(words):
         return None
+    own = [unit for number in numbers if (unit := _since_1970(number)) is not None]
+    if len(set(own)) > 1 and len(own) == len(numbers):
+        parts = [int((number * UNITS_NS[unit]).to_integral_value()) for number, unit in zip(numbers, own, strict=True)]
+        return Stamps(np.array(parts, dtype=np.int64), " and ".join(dict.fromkeys(own)))
     units = {unit: _in_ns(numbers, unit) for unit in _possible(numbers)}
     known = {unit: ns for unit, ns in units.items() if ns is not None}
     if not known:
         return None
-    unit = next(iter(known)) if like is None else max(known, key=lambda each: _overlap(known[each], like.ns))
+    if said in known:
+        unit = said
+    else:
+        unit = next(iter(known)) if like is None else max(known, key=lambda each: _overlap(known[each], like.ns))
     return Stamps(known[unit], unit)
 
 
@@ -86,15 +96,18 @@ def _possible(numbers: Sequence[Decimal]) -> list[str]:
     """Units that numbers may be in, the likeliest first."""
     ordered = sorted(numbers)
     middle = ordered[len(ordered) // 2]
-    for unit, per_ns in UNITS_NS.items():
-        scale = 10**9 // per_ns
-        if _SINCE_1970_S[0] * scale <= middle < _SINCE_1970_S[1] * scale:
-            return [unit]
+    if (unit := _since_1970(middle)) is not None:
+        return [unit]
     steps = sorted(after - before for before, after in pairwise(ordered) if after > before)
     step = steps[len(steps) // 2] if steps else Decimal(1)
-    scales = {unit: 10**9 // per_ns for unit, per_ns in UNITS_NS.items()}
-    likeliest = next((unit for unit in UNITS_NS if step <= _LONGEST_STEP_S * scales[unit]), "ns")
+    likeliest = next((unit for unit in UNITS_NS if step <= _LONGEST_STEP_S * _PER_S[unit]), "ns")
     return [likeliest, *(unit for unit in UNITS_NS if unit != likeliest)]
+
+
+def _since_1970(number: Decimal) -> str | None:
+    """The unit in which a number is a time since 1970; None where it is none in any."""
+    first, last = _SINCE_1970_S
+    return next((unit for unit, scale in _PER_S.items() if first * scale <= number < last * scale), None)
 
 
 def _in_ns(numbers: Sequence[Decimal], unit: str) -> NDArray[np.int64] | None:

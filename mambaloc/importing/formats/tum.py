@@ -18,6 +18,7 @@ from mambaloc.errors import InputError
 from mambaloc.images import pictures
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
+from mambaloc.importing.formats.column_names import scale_of
 from mambaloc.importing.formats.finding import find_pictures
 from mambaloc.importing.formats.parsing import (
     Table,
@@ -133,10 +134,12 @@ def _capture(
     quaternion = table.numbers[:, 3:] if scalar == "first" else np.roll(table.numbers[:, 3:], 1, axis=1)
     checked = from_quaternions(table.numbers[:, :3], quaternion, table.where)
     unit: Unit = "metre" if kind == "tum_rgbd" else "unknown"
+    length_m = layout.metres_per_unit(table.path)
+    known = "metres, as the benchmark has them" if unit == "metre" else "unknown: a trajectory does not tell"
     choices = {
         "axes": "OpenCV camera axes, as the format has them",
         "direction": f"camera-to-world, scalar {scalar}, as {said}",
-        "scale": "metres, as the benchmark has them" if unit == "metre" else "unknown: a trajectory does not tell",
+        "scale": scale_of(length_m, known),
         "origin": "kept",
         "association": how,
         **checked.choices,
@@ -144,8 +147,7 @@ def _capture(
     if all(time_s is not None for _, _, time_s in rows):
         rows = sorted(rows, key=lambda row: row[2] or 0.0)
     sequence = folder_name(source)
-    posed = [
-        Posed(image, sequence, checked.poses[row], time_s=time_s, fault=checked.faults.get(row, ""))
-        for image, row, time_s in rows
-    ]
-    return build_capture(kind, source, posed, unit=unit, choices=choices, missing=missing, beside=beside)
+    posed = [Posed(image, sequence, checked[row], time_s=time_s) for image, row, time_s in rows]
+    return build_capture(
+        kind, source, posed, unit=unit, choices=choices, missing=missing, beside=beside, metres_per_unit=length_m
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import string
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -256,3 +257,12 @@ def test_a_text_model_is_read_whole(names, points, eol, exponents, has_points, e
     for number, image in images.items():
         np.testing.assert_allclose(image.cam_from_world().translation, (number + 0.25, 2, 3))
         assert len(image.points2D) == len((points[number - 1] or "").split()) // 3
+
+
+def test_a_failing_search_walks_the_folder_once(tmp_path, monkeypatch):
+    walks, walk = [], os.walk
+    monkeypatch.setattr(os, "walk", lambda top: walks.append(top) or walk(top))
+    made(tmp_path, "images/1.png")
+    with pytest.raises(InputError, match=r"such as 'images/2\.png', while 'images/1\.png' is there"):
+        find_pictures(tmp_path, [("images/2.png", "here")])
+    assert walks == [tmp_path]

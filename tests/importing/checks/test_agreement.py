@@ -119,6 +119,10 @@ def test_pictures_tell_in_which_convention_poses_are(written, convention):
     concern = check_agreement(found)[0].concern
     assert (f"look like {convention}" in concern) == (convention != AS_READ)
     assert bool(concern) == (convention != AS_READ)
+    is_format = convention == "world to camera"
+    said = check_agreement(replace(found, kind="csv"))[0].concern
+    assert ("import them with --format csv_cam_from_world" in said) == is_format
+    assert ("convert them to camera to world in OpenCV's axes" in said) == (not is_format and convention != AS_READ)
 
 
 def test_pictures_of_other_poses_agree_with_none(written):

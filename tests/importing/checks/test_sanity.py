@@ -130,7 +130,8 @@ def test_a_pose_that_stays_is_named_with_its_frames():
     poses = poses_at(line(60))
     poses[50:] = poses[49]
     finding = sanity.check_duplicates(capture_of(poses), motion_of(capture_of(poses)))
-    assert "stood still in 11 successive frames, 0049.png to 0059.png; remove these if" in finding.concern
+    assert "most in a row 0049.png to 0059.png (11 frames): a tracker that is lost repeats" in finding.concern
+    assert "take them and their poses out of the capture and import it again" in finding.concern
     split = capture_of(poses, sequences=tuple(f"seq-{row}" for row in range(60)))
     assert "successive" not in sanity.check_duplicates(split, motion_of(split)).concern
     assert not finding.is_fatal

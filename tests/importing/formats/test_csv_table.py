@@ -12,6 +12,7 @@ from recorded import FRAMES
 
 from mambaloc.importing.formats.csv_table import read_csv
 from mambaloc.importing.registry import read_capture
+from mambaloc.importing.world import in_its_world
 
 OURS = ["scene", "split", "image", "x", "y", "z", "qw", "qx", "qy", "qz"]
 TRANSPOSENET = ["", "scene", "split", "seq", "img_path", "t1", "t2", "t3", "q1", "q2", "q3", "q4"]
@@ -81,6 +82,67 @@ def test_images_lie_by_the_table_or_in_images_or_without_the_scene(recording, tm
     np.testing.assert_allclose(capture.world_from_cam, np.delete(recording.world_from_cam, 2, axis=0), atol=1e-12)
 
 
+NAMED = {
+    "image,x [m],y [m],z [m],qw [],qx [],qy [],qz []": 1.0,
+    "image,pos_x[mm],pos_y[mm],pos_z[mm],q_w,q_x,q_y,q_z": 0.001,
+    "#filename;p_RS_R_x [m];p_RS_R_y [m];p_RS_R_z [m];q_RS_w [];q_RS_x [];q_RS_y [];q_RS_z []": 1.0,
+    "name,pose.position.x,pose.position.y,pose.position.z,pose.orientation.w,pose.orientation.x,pose.orientation.y,"
+    "pose.orientation.z": None,
+    "Image Name,Position X [km],Position Y [km],Position Z [km],Quaternion W,Quaternion X,Quaternion Y,"
+    "Quaternion Z": 1000.0,
+    "img,tx_cm,ty_cm,tz_cm,quat_w,quat_x,quat_y,quat_z": 0.01,
+}
+
+
+@pytest.mark.parametrize(("header", "length_m"), NAMED.items())
+def test_names_of_columns_as_programs_write_them(folder, recording, header, length_m):
+    delimiter = ";" if ";" in header else ","
+    rows = lines(recording, OURS[2:], delimiter=delimiter).splitlines()[1:]
+    if length_m not in (None, 1.0):
+        cells = [row.split(delimiter) for row in rows]
+        scaled = [[each[0], *(repr(float(word) / length_m) for word in each[1:4]), *each[4:]] for each in cells]
+        rows = [delimiter.join(each) for each in scaled]
+    (folder / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
+    capture = read_capture(folder)
+    assert capture.metres_per_unit == length_m
+    capture, _ = in_its_world(capture, None)
+    assert capture.unit == ("unknown" if length_m is None else "metre")
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-12)
+
+
+def test_frames_by_their_numbers(recording, tmp_path):
+    recording.write(tmp_path / "images", [f"frame_{number:05d}.jpg" for number in range(FRAMES)])
+    names = list(map(str, range(FRAMES)))
+    (tmp_path / "poses.csv").write_text(lines(recording, OURS[2:], names=names).replace("image", "frame", 1))
+    np.testing.assert_allclose(read_capture(tmp_path).world_from_cam, recording.world_from_cam, atol=1e-12)
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_decimal_commas_of_spreadsheets(folder, recording, delimiter):
+    header, *rows = lines(recording, [*OURS[2:], "time"], delimiter=delimiter).splitlines()
+    rows = [delimiter.join([row.split(delimiter)[0], *row.replace(".", ",").split(delimiter)[1:]]) for row in rows]
+    (folder / "poses.csv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-16")
+    capture = read_capture(folder)
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-12)
+    np.testing.assert_allclose(capture.time_s, np.arange(FRAMES) / 10)
+
+
+def test_velocities_and_covariances_are_no_positions(folder, recording):
+    header = "image,pos_x,pos_y,pos_z,q_w,q_x,q_y,q_z,v_x,v_y,v_z,position_covariance_x,px,py"
+    rows = [f"{row},9,9,9,9,9,9" for row in lines(recording, OURS[2:]).splitlines()[1:]]
+    (folder / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
+    np.testing.assert_allclose(read_capture(folder).world_from_cam, recording.world_from_cam, atol=1e-12)
+
+
+def test_a_times_unit_is_taken_where_its_size_allows_it(folder, recording):
+    """Guess: 0, 100, 200 are taken for seconds unless the name says otherwise. Wrong: steps of 100 are milliseconds."""
+    for name, expected in (("time", 0.1), ("time [s]", 100.0), ("time_ms", 0.1), ("timestamp (us)", 1e-4)):
+        header, *rows = lines(recording, OURS[2:]).splitlines()
+        rows = [f"{row},{100 * number}" for number, row in enumerate(rows)]
+        (folder / "poses.csv").write_text("\n".join([f"{header},{name}", *rows]) + "\n")
+        np.testing.assert_allclose(read_capture(folder).time_s, expected * np.arange(FRAMES))
+
+
 def test_a_direction_that_is_not_told_is_asked_for(recording, tmp_path, refused):
     names = [f"KingsCollege/seq1/{k}.png" for k in range(FRAMES)]
     recording.write(tmp_path, names)
@@ -120,6 +182,10 @@ HEADER = "image,x,y,z,qw,qx,qy,qz\n"
         (HEADER.replace("image,", "image,seq,sequence,") + ROW, "line 1: must name the sequence once"),
         (HEADER.replace("y,", "x,") + ROW, "line 1: names the column 'x' twice"),
         ("image,x,y,z,q1,q2,q3,q4\n" + ROW, "line 1: q1,q2,q3,q4 do not say which is the scalar"),
+        (
+            HEADER.replace("x,y,z", "x [m],y [m],z [ft]") + ROW,
+            "line 1: positions are in no one unit of length (x [m], y [m], z [ft]). Write x, y and z in metres.",
+        ),
         (HEADER + ROW + "a.jpg,0,0\n", "line 3: has 3 fields where the first line names 8"),
         (HEADER + ROW.replace("1", "one"), "line 2: x,y,z,qw,qx,qy,qz must be numbers"),
         (HEADER + ROW.replace("1", "0.1"), "line 2: the quaternion is far from unit length"),

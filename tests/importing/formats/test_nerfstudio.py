@@ -78,6 +78,28 @@ def test_three_rows_are_enough(write, tmp_path):
     np.testing.assert_array_equal(read_capture(tmp_path).world_from_cam, whole)
 
 
+_BY_COLUMN = "written column after column: only so are they rotations"
+WRITTEN = {
+    "2 in one list of numbers": lambda pose: pose.ravel(),
+    "2 in one list of numbers ": lambda pose: pose[:3].ravel(),
+    _BY_COLUMN: lambda pose: pose.T,
+    f"2 in one list of numbers; {_BY_COLUMN}": lambda pose: pose.T.ravel(),
+    f"2 in one list of numbers; {_BY_COLUMN} ": lambda pose: pose[:3].T.ravel(),
+}
+
+
+@pytest.mark.parametrize(("said", "numbers"), WRITTEN.items())
+def test_numbers_in_one_list_or_column_after_column(write, tmp_path, said, numbers):
+    poses = write()
+    told = json.loads((tmp_path / "transforms.json").read_text())
+    for frame, pose in zip(told["frames"], poses, strict=True):
+        frame["transform_matrix"] = numbers(pose).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    capture = read_capture(tmp_path)
+    np.testing.assert_allclose(capture.world_from_cam, poses @ FLIP, atol=1e-12)
+    assert capture.choices["matrices"] == said.strip()
+
+
 def test_frames_come_by_number_sequence_after_sequence(write, tmp_path):
     names = ["b/f10.png", "b/f9.png", "a/f2.png", "a/f1.png", "a/x/f3.png", "a/f10.png"]
     write(names)

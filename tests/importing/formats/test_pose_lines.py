@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from recorded import FRAMES
+from recorded import FRAMES, Recording
 
 from mambaloc.importing.formats.timing import picture_stamps, stamps_of
 from mambaloc.importing.registry import read_capture
+from mambaloc.importing.world import in_its_world
 
 
 def write(recording, folder, lines, name="poses.txt", names=None):
@@ -66,7 +67,12 @@ EUROC = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x
         ("# timestamp tx ty tz w x y z", "twv"),
         ("#time x y z w i j k", "twv"),
         ("# timestamp tx ty tz q_x q_y q_z q_w", "tvw"),
+        ("# timestamp x[m] y[m] z[m] qw[] qx[] qy[] qz[]", "twv"),
+        ("# time_ns pos_x_m pos_y_m pos_z_m quat_w quat_x quat_y quat_z", "twv"),
+        ("timestamp (s);x (m);y (m);z (m);qw (-);qx (-);qy (-);qz (-)", "twv"),
+        ("# timestamp [s] x y z qw qx qy qz\n# of the room, exported on Monday", "twv"),
         ("# ground truth trajectory, made by my own tool", "tvw"),
+        ("# exported (2026-11-29) by my own tool on a b", "tvw"),
         ("# file: 'room.bag'", "tvw"),
     ],
 )
@@ -75,6 +81,57 @@ def test_headers_of_trajectories_as_programs_write_them(recording, tmp_path, hea
     lines = [f"{stamp} {line}" for stamp, line in zip(stamps, sevens(recording, order), strict=True)]
     source = write(recording, tmp_path, [header, *lines], "trajectory.txt", [f"{s}.jpg" for s in stamps])
     np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
+
+
+def test_names_in_quotes(recording, tmp_path):
+    names = [f"my picture {row}.jpg" for row in range(FRAMES)]
+    lines = [f'"{name}" {line}' for name, line in zip(names, sevens(recording, "twv"), strict=True)]
+    source = write(recording, tmp_path, ["# image x y z qw qx qy qz", *lines], names=names)
+    np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
+
+
+def test_a_file_may_mix_units_of_times_since_1970(recording, tmp_path):
+    """A logger that was updated: milliseconds at first, then nanoseconds."""
+    ns = [1700000000_123_000_000 + row * 100_000_000 for row in range(FRAMES)]
+    words = [str(each // 10**6 if row < 3 else each) for row, each in enumerate(ns)]
+    lines = [f"{word} {line}" for word, line in zip(words, sevens(recording, "tvw"), strict=True)]
+    capture = read_capture(write(recording, tmp_path, lines, "trajectory.txt", [f"{each}.jpg" for each in ns]))
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-9)
+    assert "poses are timed in ms and ns" in capture.choices["association"]
+
+
+HEADERS = [
+    ("# timestamp {}[mm] {}[mm] {}[mm] qw qx qy qz", "mm", 0.001),
+    ("# timestamp {}_cm {}_cm {}_cm qw qx qy qz", "cm", 0.01),
+    ("# timestamp {} (feet) {} (feet) {} (feet) qw qx qy qz", "feet", 0.3048),
+    ("# timestamp {} [m] {} [m] {} [m] qw [] qx [] qy [] qz []", "m", 1.0),
+    ("# timestamp {} {} {} qw qx qy qz", "", None),
+]
+
+
+@pytest.mark.parametrize(("header", "unit", "length_m"), HEADERS)
+@pytest.mark.parametrize("kind", ["tum", "pose_lines"])
+def test_a_headers_unit_is_that_of_the_positions(recording, tmp_path, kind, header, unit, length_m):
+    scaled = Recording(recording.world_from_cam.copy(), recording.jpegs)
+    scaled.world_from_cam[:, :3, 3] /= length_m or 1.0
+    names = [f"{1403636579 + row / 10:.6f}.jpg" for row in range(FRAMES)]
+    first = [name.removesuffix(".jpg") if kind == "tum" else name for name in names]
+    lines = [f"{word} {line}" for word, line in zip(first, sevens(scaled, "twv"), strict=True)]
+    capture = read_capture(write(recording, tmp_path, [header.format(*"xyz"), *lines], "poses.txt", names))
+    assert (capture.kind, capture.metres_per_unit) == (kind, length_m)
+    capture, lost = in_its_world(capture, None)
+    assert not lost
+    np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-9)
+    assert capture.unit == ("unknown" if length_m is None else "metre")
+    assert (f"{length_m:g} m, as the columns' names say" if length_m else "unknown") in capture.choices["scale"]
+    assert capture.world.metres_per_unit == (length_m or 1.0)
+
+
+@pytest.mark.parametrize("header", ["# name x[m] y[cm] z[m] qw qx qy qz", "# name x[px] y[px] z[px] qw qx qy qz"])
+def test_a_headers_unit_that_is_no_length_is_refused(recording, tmp_path, refused, header):
+    lines = [f"{row:03d}.jpg {line}" for row, line in enumerate(sevens(recording, "twv"))]
+    source = write(recording, tmp_path, [header, *lines])
+    refused(read_capture, source, "poses.txt: its header: positions are in no one unit of length (x [", "in metres.")
 
 
 @pytest.mark.parametrize("named", ["123456.000", "a.jpg"])
