@@ -11,7 +11,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from jsonargparse import Namespace
+from jsonargparse import Namespace, class_from_function
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
@@ -272,7 +272,7 @@ def main(argv: list[str] | None = None, began_s: float | None = None) -> RecipeC
     with tell_refusals(argv):
         return RecipeCLI(
             LitPoseRegressor,
-            build_data,
+            class_from_function(build_data, L.LightningDataModule),
             began_s=began_s,
             parser_class=OneLineErrorParser,
             subclass_mode_model=True,

@@ -7,7 +7,7 @@ from mambaloc import benchmark, list_models, provenance
 from mambaloc.console import OptionParser, exits_cleanly, quieten, thread_count, whole_number
 from mambaloc.errors import InputError
 from mambaloc.models.registry import model_class
-from mambaloc.zoo.bundles import load_with_data
+from mambaloc.zoo.bundles import load_with_scene
 
 
 @exits_cleanly
@@ -53,7 +53,7 @@ def _latency(args: argparse.Namespace) -> None:
 
 
 def _deployment(args: argparse.Namespace) -> None:
-    systems = {source: load_with_data(source) for source in args.sources}
+    systems = {source: load_with_scene(source) for source in args.sources}
     found = benchmark.measure_deployment(systems, args.threads, args.repetitions)
     benchmark.print_deployments(found, args.threads, provenance.machine())
 

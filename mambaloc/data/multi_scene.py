@@ -82,7 +82,7 @@ class MultiSceneDataModule(L.LightningDataModule):
         arguments = {key: value for key, value in self.hparams.items() if key not in taken and key[0] != "_"}
         dataset, _, scene = name.rpartition("/")
         if dataset in DATASETS and not Path(name).is_dir():
-            place = {"dataset": dataset, "scene": scene}
+            place: dict[str, Any] = {"dataset": dataset, "scene": scene}
         else:
             place = {"dataset": self.hparams["dataset"], "root": self.hparams["root"], "scene": name}
         member = PoseDataModule(batch_size=batch_size, **place, **arguments)
@@ -173,7 +173,7 @@ def _shares(sizes: list[int], batch_size: int) -> list[int]:
 
 def build_data(
     scenes: list[str] | None = None, scene_share: SceneShare = "equal", **arguments: Any
-) -> L.LightningDataModule:
+) -> PoseDataModule | MultiSceneDataModule:
     """Build the data module of a recipe's ``data``: of one scene, or of several.
 
     Args:

@@ -45,7 +45,7 @@ def load_trained(checkpoint: Checkpoint, data: PoseDataModule | None = None) -> 
     Raises:
         InputError: where its model is not registered, or for data whose crops the network was not built for.
     """
-    system, data = checkpoint.system(), data or checkpoint.data()
+    system, data = checkpoint.system(), data or checkpoint.scene_data()
     if data.crop != system.image_size:
         sizes = f"{checkpoint.path} was trained on {system.image_size}"
         raise InputError(f"data.image_size {data.crop}: {sizes}; use that")

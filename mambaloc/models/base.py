@@ -265,7 +265,7 @@ class LitPoseRegressor(L.LightningModule):
         loss = self.loss(prediction, batch)
         for auxiliary in prediction.auxiliary:
             loss = loss + 0.3 * self.loss(auxiliary, batch)
-        if prediction.scene_logits is not None:
+        if prediction.scene_logits is not None and batch.scene is not None:
             loss = loss + F.cross_entropy(prediction.scene_logits, batch.scene)
         self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch.index), sync_dist=True)
         return loss

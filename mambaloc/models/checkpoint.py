@@ -73,6 +73,17 @@ class Checkpoint:
             raise InputError(f"{self.path}: holds no data settings; train it with mambaloc train")
         return build_data(**{**arguments, **changed})
 
+    def scene_data(self, **changed: Any) -> PoseDataModule:
+        """The same, where only one scene will do.
+
+        Raises:
+            InputError: as :meth:`data`; where the network knows several scenes.
+        """
+        data = self.data(**changed)
+        if (count := len(data.each_scene())) > 1:
+            raise InputError(f"{self.path}: knows {count} scenes, and this is for one. Give a checkpoint of one scene.")
+        return data.each_scene()[0]
+
     @property
     def provenance(self) -> dict[str, Any]:
         """Model, commit, versions, device and seed of the training, and its data where it had a data module."""

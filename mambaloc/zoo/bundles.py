@@ -6,7 +6,7 @@ import hashlib
 from importlib.metadata import version
 from pathlib import Path
 
-from mambaloc.data import PoseDataModule
+from mambaloc.data import MultiSceneDataModule, PoseDataModule
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.export import write_bundle
 from mambaloc.mapping import MapSettings, build_map
@@ -26,7 +26,9 @@ _EMBEDDED_SCENE = "embedded/room"
 _EMBEDDED_MAP = MapSettings(key_frames=80, width=160)
 
 
-def load_with_data(source: str, root: str | None = None) -> tuple[LitPoseRegressor, PoseDataModule]:
+def load_with_data(
+    source: str, root: str | None = None
+) -> tuple[LitPoseRegressor, PoseDataModule | MultiSceneDataModule]:
     """Load a trained system, and the scene that it knows.
 
     A checkpoint tells all about its data; a released model only which scene: its whole training split is then meant.
@@ -44,6 +46,20 @@ def load_with_data(source: str, root: str | None = None) -> tuple[LitPoseRegress
     system, manifest = load(source), Manifest.read(released_folder(source))
     dataset, _, scene = manifest.scene.partition("/")
     data = PoseDataModule(dataset, root, scene, image_size=system.image_size, short_side=manifest.short_side)
+    return system, data
+
+
+def load_with_scene(source: str) -> tuple[LitPoseRegressor, PoseDataModule]:
+    """The same, where only a system of one scene will do.
+
+    Raises:
+        InputError: as :func:`load_with_data`; for a network that knows several scenes.
+    """
+    system, data = load_with_data(source)
+    if isinstance(data, MultiSceneDataModule):
+        raise InputError(
+            f"{source}: knows {system.scene_count} scenes, and this is for one. Give a model of one scene."
+        )
     return system, data
 
 

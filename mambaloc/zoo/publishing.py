@@ -56,7 +56,7 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
         raise InputError(f"--tag {tag}: lower-case letters, digits and underscores make a tag; choose another")
     if folder.exists():
         raise InputError(f"{folder}: is released already; choose another tag")
-    system, data, sparse_map = checkpoint.system(), checkpoint.data(), map_of(str(path))
+    system, data, sparse_map = checkpoint.system(), checkpoint.scene_data(), map_of(str(path))
     if sparse_map is not None:
         check_scene(sparse_map, SparseMap.load(sparse_map), data)
     with TemporaryDirectory() as scratch:

@@ -10,7 +10,7 @@ from uncertainty_report import print_certainty, write_certainty
 
 from mambaloc import provenance
 from mambaloc.console import OptionParser, exits_cleanly, quieten
-from mambaloc.zoo.bundles import load_with_data
+from mambaloc.zoo.bundles import load_with_scene
 
 
 @exits_cleanly
@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--elsewhere", type=Path, help="folder of pictures of another place")
     parser.add_argument("--out", type=Path, default=Path("runs/uncertainty"), help="folder of the plot and the figures")
     args = parser.parse_args()
-    systems = {checkpoint: load_with_data(checkpoint) for checkpoint in args.checkpoints}
+    systems = {checkpoint: load_with_scene(checkpoint) for checkpoint in args.checkpoints}
     found = measure_certainty(systems, args.elsewhere)
     print_certainty(found, provenance.machine())
     write_certainty(found, args.out, provenance.machine())
