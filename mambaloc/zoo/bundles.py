@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from mambaloc.data import MultiSceneDataModule, PoseDataModule
+from mambaloc.errors import InputError
 from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.export import write_bundle
 from mambaloc.mapping import MapSettings, build_map
