@@ -69,7 +69,7 @@ class MultiSceneTransPoseNet(PoseNetwork):
         self.orientation_decoder = SceneDecoder(scenes, dim, decoder_layers, heads, feedforward, dropout)
         self.position_gis = build_gis(gis, dim, discretisation)
         self.orientation_gis = build_gis(gis, dim, discretisation)
-        self.scene_head = nn.Linear(2 * dim, 1)
+        self.scene_head = nn.Linear(2 * dim, 1) if scenes > 1 else None
         self.head = PoseHead(dim, hidden=head_hidden, scenes=scenes)
 
     def features(self, feats: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -87,7 +87,7 @@ class MultiSceneTransPoseNet(PoseNetwork):
         self, branches: tuple[Tensor, Tensor], intrinsics: Tensor | None = None, scene: Tensor | None = None
     ) -> PosePrediction:
         """Recognise the scene, and regress the pose from the answers to its query."""
-        if self.scenes == 1:
+        if self.scene_head is None:
             return self.head(*(each[:, 0] for each in branches))
         logits = self.scene_head(torch.cat(branches, dim=-1)).squeeze(-1)
         scene = logits.argmax(dim=-1) if scene is None else scene
