@@ -148,11 +148,6 @@ class PoseDataModule(L.LightningDataModule):
         """This scene's data module: :class:`~mambaloc.data.MultiSceneDataModule` has several."""
         return [self]
 
-    @property
-    def training_batches(self) -> int:
-        """Batches of an epoch."""
-        return len(self.train_dataloader())
-
     def setup(self, stage: str) -> None:
         """Read and decode what a stage needs; every process may, since the cache is built by one of them."""
         if stage in ("fit", "validate"):

@@ -104,13 +104,8 @@ class MultiSceneDataModule(L.LightningDataModule):
         """Each scene's name, and where its frame lies in the world of the data that it was made of."""
         return [(name, each.world) for name, each in zip(self.scenes, self.each_scene(), strict=True)]
 
-    @property
-    def training_batches(self) -> int:
-        """Batches of an epoch: a pass over the scene that needs most; the others begin again."""
-        return max(each.training_batches for each in self.each_scene())
-
     def train_dataloader(self) -> CombinedLoader:
-        """Shuffled training batches, in parts of each scene."""
+        """Shuffled training batches of all scenes: a pass over the one that needs most; the others begin again."""
         return CombinedLoader([each.train_dataloader() for each in self.each_scene()], "max_size_cycle")
 
     def val_dataloader(self) -> list[DataLoader[PoseBatch]]:

@@ -214,7 +214,7 @@ class LitPoseRegressor(L.LightningModule):
         if stage == "fit" and self.normalise_position:
             for module in self.network.modules():
                 if isinstance(module, PositionScale):
-                    scenes = self.scene_for("normalise_position").each_scene()
+                    scenes = self.scenes_for("normalise_position")
                     for index in self._new_scenes:
                         module.fit(scenes[index].train_position_m, index)
         if stage == "fit" and self.compile_mode is not None:
@@ -242,6 +242,11 @@ class LitPoseRegressor(L.LightningModule):
         if data is None:
             raise InputError(f"model.{argument}: needs the scene; give the trainer a PoseDataModule")
         return data
+
+    def scenes_for(self, argument: str) -> list[Any]:
+        """Return the data module of each scene, as :meth:`scene_for`."""
+        data = self.scene_for(argument)
+        return data.each_scene() if self.scene_count > 1 else [data]
 
     def on_train_epoch_start(self) -> None:
         """Log the learning rate."""
@@ -327,7 +332,7 @@ class LitPoseRegressor(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": by_step, "interval": "step"}}
 
     def _steps_in_all(self) -> int:
-        batches = self.scene_for("schedule").training_batches
+        batches = max(len(each.train_dataloader()) for each in self.scenes_for("schedule"))
         return training_steps(self.trainer, batches, self.schedule)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

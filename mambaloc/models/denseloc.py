@@ -171,6 +171,6 @@ class LitDenseLoc(LitPoseRegressor):
     def setup(self, stage: str) -> None:
         """Take the training cameras' median besides: what an image without intrinsics is taken to be seen by."""
         super().setup(stage)
-        if stage == "fit" and (data := getattr(self.trainer, "datamodule", None)) is not None:
-            intrinsics = torch.cat([each.train_intrinsics for each in data.each_scene()])
+        if stage == "fit" and getattr(self.trainer, "datamodule", None) is not None:
+            intrinsics = torch.cat([each.train_intrinsics for each in self.scenes_for("default_intrinsics")])
             self.network.default_intrinsics.copy_(intrinsics.median(dim=0).values)

@@ -44,7 +44,7 @@ class PoseNetwork(nn.Module):
         """Turn what the backbone returns into the position and orientation branches' features.
 
         Shape:
-            (B, D) each of the whole image; (B, N, D) each of a dense head's N cells.
+            (B, D) each of the whole image; (B, N, D) each of a dense head's N cells, or of the queries of N scenes.
         """
         raise NotImplementedError
 
