@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 import time
@@ -30,7 +31,7 @@ from mambaloc.callbacks import (
     WholeCheckpoints,
 )
 from mambaloc.console import exits_cleanly, quieten
-from mambaloc.data import MultiSceneDataModule, build_data
+from mambaloc.data import MultiSceneDataModule, PoseDataModule, build_data
 from mambaloc.distillation import LitDistillation
 from mambaloc.errors import InputError
 from mambaloc.evaluation import (
@@ -96,6 +97,8 @@ class RecipeCLI(LightningCLI):
                 }
             )
         parser.set_defaults({"best_checkpoint.monitor": "val/loss"})
+        of_a_scene = inspect.signature(PoseDataModule).parameters.values()  # build_data hands them on without defaults
+        parser.set_defaults({f"data.{each.name}": each.default for each in of_a_scene})
         parser.add_argument(
             "--retrieval", type=bool, default=False, help="also measure retrieval on the backbone's first features"
         )
