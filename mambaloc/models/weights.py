@@ -109,7 +109,10 @@ def build_from(stored: dict[str, Any], cls: type[_System], strict: bool = True, 
     """
     # Without Lightning's own notes on the class: which one to build is not the file's to say.
     arguments = {name: value for name, value in stored.get("hyper_parameters", {}).items() if not name.startswith("_")}
-    arguments |= dict.fromkeys({"backbone_weights", "warm_start"} & set(arguments)) | changed
+    arguments |= dict.fromkeys({"backbone_weights", "warm_start"} & set(arguments))
+    if "new_scenes_only" in arguments:  # of a training, whose other scenes were warm_start's
+        arguments["new_scenes_only"] = False
+    arguments |= changed
     taken = inspect.signature(cls).parameters
     if not any(each.kind is each.VAR_KEYWORD for each in taken.values()):  # else a base class takes the others
         arguments = {name: value for name, value in arguments.items() if name in taken}

@@ -1,10 +1,12 @@
 """Networks that know several scenes: each has outputs of its own, beside which the others change nothing."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from mambaloc.errors import InputError
-from mambaloc.models import create_model, list_models
+from mambaloc.models import Checkpoint, create_model, list_models
 from mambaloc.models.registry import model_class
 from mambaloc.nn import PositionScale
 from mambaloc.types import PoseBatch
@@ -167,6 +169,19 @@ def test_with_new_scenes_only_the_others_do_not_change(tmp_path):
         for kind in ("weight", "bias")
     }
     assert all(changed in (lab, [False], [False] * 3) for changed in is_changed.values())
+
+
+def test_what_learned_new_scenes_alone_is_loaded_without_its_start(tmp_path):
+    path = checkpoint_of(build("denseloc", ["hall", "office"], seed=2), tmp_path / "before.ckpt")
+    system = build("denseloc", SCENES, seed=3, warm_start=path, new_scenes_only=True).eval()
+    after = checkpoint_of(system, tmp_path / "after.ckpt")
+    Path(path).unlink()
+    batch = batch_of([0, 1, 2])
+    with torch.inference_mode():
+        expected, told = (
+            each(batch.image, batch.intrinsics, batch.scene) for each in (system, Checkpoint.read(after).system())
+        )
+    torch.testing.assert_close(told.position_m, expected.position_m, rtol=0, atol=0)
 
 
 def test_new_scenes_alone_need_a_checkpoint_and_a_new_scene(tmp_path):
