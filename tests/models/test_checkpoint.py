@@ -52,6 +52,7 @@ def test_hyperparameters_given_to_load_from_checkpoint_replace_the_stored(best):
 
 def test_the_data_is_that_of_the_recipe(best, trained):
     recipe = yaml.safe_load((trained / "config.yaml").read_text())["data"]
+    assert (recipe.pop("scenes"), recipe.pop("scene_share")) == (None, "equal")  # it is of one scene
     assert {name: best.data().hparams[name] for name in recipe} == recipe
     assert best.data(root="/elsewhere").hparams["root"] == "/elsewhere"
     without = replace(best, stored={**best.stored, "datamodule_hyper_parameters": {}})
