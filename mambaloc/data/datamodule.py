@@ -109,8 +109,7 @@ class PoseDataModule(L.LightningDataModule):
         cache_dir: str | None = None,
     ) -> None:
         super().__init__()
-        image_size = image_size if isinstance(image_size, int) else list(image_size)  # type: ignore[assignment]
-        self.save_hyperparameters()  # as the model keeps its image size: Lightning compares the two
+        self.save_hyperparameters()
         for several in ("scenes", "scene_share"):  # of a recipe's data; this is one scene
             self.hparams.pop(several, None)
         self.scene = Scene(**{field.name: self.hparams[field.name] for field in fields(Scene)})

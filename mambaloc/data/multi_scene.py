@@ -53,8 +53,7 @@ class MultiSceneDataModule(L.LightningDataModule):
         **arguments: Any,
     ) -> None:
         super().__init__()
-        image_size = image_size if isinstance(image_size, int) else list(image_size)  # type: ignore[assignment]
-        self.save_hyperparameters()  # as the model keeps its image size: Lightning compares the two
+        self.save_hyperparameters()
         if len(set(scenes)) < len(scenes) or len(scenes) < 2:
             raise InputError(f"data.scenes {scenes}: must name two scenes or more, each once. For one, set data.scene.")
         if scene_share not in get_args(SceneShare):
@@ -67,25 +66,23 @@ class MultiSceneDataModule(L.LightningDataModule):
     def each_scene(self) -> list[PoseDataModule]:
         """The data modules of the scenes, in the order of their numbers."""
         if not self._members:
-            even = _shares([1] * len(self.scenes), self.hparams["batch_size"])
-            self._members = [self._member(*each) for each in zip(range(len(even)), self.scenes, even, strict=True)]
-            if self.hparams["scene_share"] == "size":
-                sizes = [len(each.chosen_training_frames()) for each in self._members]
-                shares = _shares(sizes, self.hparams["batch_size"])
-                self._members = [
-                    self._member(*each) for each in zip(range(len(shares)), self.scenes, shares, strict=True)
-                ]
+            members = [self._member(index, name) for index, name in enumerate(self.scenes)]
+            is_even = self.hparams["scene_share"] == "equal"
+            sizes = [1 if is_even else len(each.chosen_training_frames()) for each in members]
+            for each, share in zip(members, _shares(sizes, self.hparams["batch_size"]), strict=True):
+                each.hparams["batch_size"] = share
+            self._members = members  # only now: where a scene cannot be read, none is kept
         return self._members
 
-    def _member(self, index: int, name: str, batch_size: int) -> PoseDataModule:
-        taken = {"scenes", "scene_share", "dataset", "root", "batch_size", "scene"}
+    def _member(self, index: int, name: str) -> PoseDataModule:
+        taken = {"scenes", "scene_share", "dataset", "root", "scene"}
         arguments = {key: value for key, value in self.hparams.items() if key not in taken and key[0] != "_"}
         dataset, _, scene = name.rpartition("/")
         if dataset in DATASETS and not Path(name).is_dir():
             place: dict[str, Any] = {"dataset": dataset, "scene": scene}
         else:
             place = {"dataset": self.hparams["dataset"], "root": self.hparams["root"], "scene": name}
-        member = PoseDataModule(batch_size=batch_size, **place, **arguments)
+        member = PoseDataModule(**place, **arguments)
         member.scene_index = index
         return member
 
@@ -110,7 +107,8 @@ class MultiSceneDataModule(L.LightningDataModule):
 
     def val_dataloader(self) -> list[DataLoader[PoseBatch]]:
         """Validation batches in order, a loader a scene; none under ``validation: none``."""
-        return [each.val_dataloader() for each in self.each_scene() if each.val_dataloader()]  # type: ignore[misc]
+        loaders = (each.val_dataloader() for each in self.each_scene())
+        return [each for each in loaders if isinstance(each, DataLoader)]
 
     def test_dataloader(self) -> list[DataLoader[PoseBatch]]:
         """Test batches in order, a loader a scene."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_args
 
@@ -24,6 +23,7 @@ from mambaloc.metrics import PoseErrors
 from mambaloc.models.compiling import CompileMode, compile_forward
 from mambaloc.models.feature_cache import FeatureCache
 from mambaloc.models.optim import Schedule, build_adam, build_step_schedule, check_span, training_steps
+from mambaloc.models.scene_tables import train_rows_only
 from mambaloc.models.weights import build_from, read_checkpoint, start_from
 from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale, SplitBackbone, recompute_stages
 from mambaloc.types import PoseBatch, PosePrediction, height_and_width
@@ -137,6 +137,8 @@ class LitPoseRegressor(L.LightningModule):
             )
         if feature_cache_gib and compile_mode:
             raise InputError("model.feature_cache_gib: its steps do not run compiled. Set compile_mode to null.")
+        if feature_cache_gib and len(scenes or ()) > 1:
+            raise InputError("model.feature_cache_gib: keeps features of one scene. Set it to 0 for data.scenes.")
         self.scene_count = max(1, len(scenes or ()))
         if self.scene_count > 1 and not self.takes_scenes:
             name = getattr(self, "registry_name", type(self).__name__)
@@ -146,7 +148,8 @@ class LitPoseRegressor(L.LightningModule):
         self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode
         self._compiled: Callable[..., PosePrediction] | None = None
         self._split: tuple[SplitBackbone, FeatureCache] | None = None
-        self.val_errors, self.test_errors, self.val_loss = PoseErrors(), PoseErrors(), MeanMetric()
+        self.val_errors, self.test_errors = PoseErrors(), PoseErrors()
+        self.val_loss = MeanMetric(nan_strategy="disable")  # else NaN would be left out of the mean
         self.provenance: dict[str, Any] = {}
         self.save_hyperparameters()
         self.network = self.configure_network()
@@ -155,7 +158,12 @@ class LitPoseRegressor(L.LightningModule):
             known = start_from(self.network, warm_start, scenes or [])
             if new_scenes_only:
                 self._new_scenes = [index for index, name in enumerate(scenes or []) if name not in known]
-                self._train_new_scenes_only()
+                if not self._new_scenes:
+                    raise InputError(
+                        "model.new_scenes_only: the checkpoint of warm_start knows all scenes. Add one to data.scenes."
+                    )
+                train_rows_only(self.network, self._new_scenes)
+                self.weight_decay = 0.0  # it would shrink the others' rows
         elif new_scenes_only:
             raise InputError("model.new_scenes_only: needs model.warm_start, a checkpoint that knows the other scenes.")
         if frozen_groups:
@@ -164,21 +172,6 @@ class LitPoseRegressor(L.LightningModule):
             self.network.backbone.freeze_statistics()
         if recomputed_stages:
             recompute_stages(self.network.backbone.model, self.network.backbone.name, recomputed_stages)
-
-    def _train_new_scenes_only(self) -> None:
-        """Freeze all but the rows of new scenes, whose gradients alone are kept."""
-        if not self._new_scenes:
-            raise InputError(
-                "model.new_scenes_only: the checkpoint of warm_start knows all scenes. Add one to data.scenes."
-            )
-        self.network.requires_grad_(False)
-        self.network.backbone.freeze_statistics()
-        self.weight_decay = 0.0  # it would shrink the others' rows
-        for name, parameter in self.network.named_parameters():
-            if name.startswith(self.network.scene_tables):
-                is_new = torch.zeros(self.scene_count, 1)
-                is_new[self._new_scenes] = 1
-                parameter.requires_grad_(True).register_hook(partial(_gradient_of_rows, is_new))
 
     def configure_network(self) -> PoseNetwork:
         """Build the network from the hyperparameters: images in, :class:`~mambaloc.types.PosePrediction` out."""
@@ -380,8 +373,3 @@ class LitPoseRegressor(L.LightningModule):
         kwargs.pop("weights_only", None)  # Lightning's option, which might ask for more
         system = build_from(read_checkpoint(checkpoint_path), cls, strict is not False, **kwargs)
         return system.to(map_location or "cpu")
-
-
-def _gradient_of_rows(is_counted: Tensor, grad: Tensor) -> Tensor:
-    """A gradient of those rows alone that count; (S, 1) of ones and zeros for (S * k, ...)."""
-    return (grad.reshape(len(is_counted), -1) * is_counted.to(grad)).view_as(grad)

@@ -10,9 +10,10 @@ from typing import Any, TypeVar
 
 import lightning as L
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from mambaloc.errors import InputError
+from mambaloc.models.scene_tables import rows_of_scenes
 from mambaloc.nn import PoseNetwork
 
 _System = TypeVar("_System", bound=L.LightningModule)
@@ -59,11 +60,11 @@ def start_from(network: PoseNetwork, path: str | Path, scenes: Sequence[str] = (
         stored = read_checkpoint(path)
     except InputError as error:
         raise InputError(f"model.warm_start: {error}; train it first, or set it to null") from None
-    known = stored["hyper_parameters"].get("scenes") or [_only_scene(stored)]
+    known = stored.get("hyper_parameters", {}).get("scenes") or [_only_scene(stored)]
     state = {k.removeprefix(prefix): v for k, v in stored["state_dict"].items() if k.startswith(prefix)}
     try:
         if network.scenes > 1 and list(scenes) != known:
-            state |= _rows_of_scenes(network, state, known, scenes)
+            state |= rows_of_scenes(network, state, known, scenes)
         network.load_state_dict(state)
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
@@ -76,24 +77,6 @@ def start_from(network: PoseNetwork, path: str | Path, scenes: Sequence[str] = (
 
 def _only_scene(stored: dict[str, Any]) -> str:
     return str(stored.get("datamodule_hyper_parameters", {}).get("scene", ""))
-
-
-def _rows_of_scenes(
-    network: PoseNetwork, state: dict[str, Tensor], known: list[str], scenes: Sequence[str]
-) -> dict[str, Tensor]:
-    """What a network of other scenes is to have in its tables: rows of known scenes, and its own of new ones."""
-    rows = {}
-    for name, own in network.state_dict().items():
-        if not name.startswith(network.scene_tables):
-            continue
-        table = own.clone().reshape(len(scenes), -1)
-        if name in state:  # that of one scene recognises none
-            other = state[name].reshape(len(known), -1)
-            for index, scene in enumerate(scenes):
-                if scene in known:
-                    table[index] = other[known.index(scene)]
-        rows[name] = table.view_as(own)
-    return rows
 
 
 def build_from(stored: dict[str, Any], cls: type[_System], strict: bool = True, **changed: Any) -> _System:

@@ -1,5 +1,6 @@
 """Networks that know several scenes: each has outputs of its own, beside which the others change nothing."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,19 @@ def test_in_a_scene_a_dense_head_answers_as_a_network_of_that_scene_alone(index)
         told, expected = several(batch.image, batch.intrinsics, batch.scene), alone(batch.image, batch.intrinsics)
     torch.testing.assert_close(told.position_m, expected.position_m)
     torch.testing.assert_close(told.quaternion, expected.quaternion)
+
+
+def test_features_are_kept_of_one_scene_alone():
+    with pytest.raises(InputError, match=r"model\.feature_cache_gib: keeps features of one scene"):
+        build("denseloc", SCENES, feature_cache_gib=0.1)
+
+
+def test_a_loss_of_nan_is_not_left_out_of_the_mean_over_scenes(name):
+    system, batch = build(name, SCENES).eval(), batch_of([0, 1])
+    bad = replace(batch, position_m=batch.position_m * torch.nan)
+    for each in (batch, bad):
+        system.validation_step(each, 0)
+    assert system.val_loss.compute().isnan()
 
 
 def test_without_a_scene_the_pose_is_the_likeliest_ones(name):
