@@ -19,7 +19,8 @@ SIDE = 64  # at stride 32 two by two, among which TransBoNet attends
 
 # What makes a system small; each takes those arguments that it has.
 SMALL = {
-    "encoder_layers": 1, "dim": 32, "heads": 4, "feedforward": 32, "head_hidden": 32, "width": 64, "hidden": 16,
+    "encoder_layers": 1, "decoder_layers": 1, "dim": 32, "heads": 4, "feedforward": 32, "head_hidden": 32, "width": 64,
+    "hidden": 16,
     "stage_channels": 64, "blocks": 2, "groups": 4,
 }  # fmt: skip
 
