@@ -63,18 +63,18 @@ def capture(den, tmp_path):
 # --- which frames ----------------------------------------------------------------------------------------------------
 
 
-def test_it_is_built_from_the_frames_that_are_trained_on_and_no_others(den, tmp_path, capsys):
+def test_it_is_built_from_the_frames_that_are_trained_on_and_no_others(den, tmp_path, caplog):
     data = data_of(den, validation="block", val_fraction=0.2, val_gap=2)  # of 32: 24 to train on, 6 to validate on
     run = run_of(data, tmp_path)
-    capsys.readouterr()
+    caplog.set_level("INFO")
     MapBuild(enabled=True, **SETTINGS).on_fit_start(run, None)
     built = SparseMap.load(tmp_path / "map/map.safetensors")
     assert frames_of(built, den) == list(range(24))
     assert built.scene == "den"
     assert built.digests["frames"] == data.chosen_training_frames().digest()
-    said = capsys.readouterr().out
-    assert said.startswith(f"{tmp_path}/map/map.safetensors: points triangulated: {len(built)}, in 24 key frames, ")
-    assert said.count("\n") == 1
+    [line] = [record.getMessage() for record in caplog.records if record.name.startswith("mambaloc")]
+    assert line.startswith(f"{tmp_path}/map/map.safetensors: points triangulated: {len(built)}, in 24 key frames, ")
+    assert "\n" not in line
 
 
 def test_frames_that_are_thinned_away_are_not_in_it(den, tmp_path):
@@ -99,7 +99,8 @@ def test_other_ranks_and_trial_runs_build_none(changed, den, tmp_path):
     assert not (tmp_path / "map").exists()
 
 
-def test_a_resumed_run_keeps_its_map_unless_frames_or_settings_changed(den, tmp_path, monkeypatch, capsys):
+def test_a_resumed_run_keeps_its_map_unless_frames_or_settings_changed(den, tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
     built = []
     build = map_build.build_map
     monkeypatch.setattr(map_build, "build_map", lambda *args, **kwargs: built.append(args) or build(*args, **kwargs))
@@ -109,7 +110,7 @@ def test_a_resumed_run_keeps_its_map_unless_frames_or_settings_changed(den, tmp_
     start(SETTINGS)
     start(SETTINGS)
     assert len(built) == 1
-    assert "is built from these frames already" in capsys.readouterr().out
+    assert "is built from these frames already" in caplog.text
     start({**SETTINGS, "key_frames": 20})
     assert len(built) == 2
     start({**SETTINGS, "key_frames": 20}, keep_every=2)
@@ -129,9 +130,9 @@ def test_a_resumed_command_leaves_the_file_alone(trained_with_map, tmp_path, cap
     main([str(recipe), *settings, "--ckpt_path", str(last), "--trainer.max_epochs", "2"])
     after = (run / "map/map.safetensors").stat()
     assert (before.st_ino, before.st_mtime_ns) == (after.st_ino, after.st_mtime_ns)
-    said = capsys.readouterr().out
-    assert f"{run}/map/map.safetensors: is built from these frames already" in said
-    assert "last and map" in said
+    output = capsys.readouterr()
+    assert f"{run}/map/map.safetensors: is built from these frames already" in output.err
+    assert "last and map" in output.out
 
 
 # --- where there can be none -----------------------------------------------------------------------------------------
