@@ -15,6 +15,7 @@ def with_preprocessing(
     """Put :class:`Preprocessing` before a network, as operators that every build of ONNX Runtime has.
 
     Averaging areas is a product with the overlaps of old and new pixels, once for rows and once for columns.
+    Rows come first and of all channels at once: only what is left is transposed.
 
     Args:
         model: the network.
@@ -40,6 +41,7 @@ def with_preprocessing(
             {_camera_constants(preprocessing, focal_px) if focal_px else f"float short_side = {{{short_side}}},"}
             float white = {{255.0}}, float one_f = {{1.0}}, float none = {{0.0}}, int64 zero = {{0}}, int64 one = {{1}},
             int64[1] first = {{0}}, int64[1] second = {{1}}, int64[1] third = {{2}}, int64[1] two = {{2}},
+            int64[1] channels = {{3}}, int64[2] row_by_row = {{0, -1}},
             int64[2] axes = {{2, 3}}, int64[2] crop = {{{height}, {width}}}
         >
         {{
@@ -55,8 +57,11 @@ def with_preprocessing(
             {_overlaps("rows", "first", "second")}
             {_overlaps("columns", "second", "third")}
             levels = Cast<to = 1>({RAW_INPUT})
-            planar = Transpose<perm = [2, 0, 1]>(levels)
-            fewer_rows = MatMul(rows_weight, planar)
+            interleaved = Reshape(levels, row_by_row)
+            fewer_interleaved = MatMul(rows_weight, interleaved)
+            fewer_shape = Concat<axis = 0>(rows_new_1, columns_old_1, channels)
+            fewer_pixels = Reshape(fewer_interleaved, fewer_shape)
+            fewer_rows = Transpose<perm = [2, 0, 1]>(fewer_pixels)
             columns_weight_t = Transpose<perm = [1, 0]>(columns_weight)
             resized = MatMul(fewer_rows, columns_weight_t)
             whole = Round(resized)
