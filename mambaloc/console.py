@@ -121,6 +121,7 @@ def quieten() -> None:
     threading.excepthook = _show_unless_of_the_disk
     own = logging.getLogger("mambaloc")
     own.setLevel(logging.INFO)
+    own.propagate = False  # ONNX Runtime's tools give the root logger a handler: each line would come twice
     if not any(isinstance(handler, _StderrLines) for handler in own.handlers):
         own.addHandler(_StderrLines())
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)

@@ -40,7 +40,7 @@ def test_a_released_model_is_created_with_its_weights():
 
 
 def test_a_released_model_keeps_its_hyperparameters():
-    with pytest.raises(InputError, match="keeps its hyperparameters. Leave out width"):
+    with pytest.raises(InputError, match=r"keeps its hyperparameters\. Leave out width"):
         mambaloc.create_model("student.embedded_room", pretrained=True, width=8)
 
 
