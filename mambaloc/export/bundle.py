@@ -74,8 +74,9 @@ def write_bundle(
         out: the folder, which must not be there yet.
         formats: of ``FORMATS``.
         target: of ``TARGETS``, which its page on integration is about.
-        raw_input: resize, crop and scale inside the models, which then take RGB of any size, as every page on integration has
-            it; otherwise they take what :class:`~mambaloc.runtime.contract.Preprocessing` makes of an image.
+        raw_input: resize, crop and scale inside the models, which then take RGB of any size, as every page on
+            integration has it; otherwise they take what :class:`~mambaloc.runtime.contract.Preprocessing` makes of
+            an image.
         sparse_map: file of a map of the scene, which is copied into the bundle; of several scenes there is none.
 
     Raises:
