@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mambaloc.data import PoseDataModule
-    from mambaloc.models import create_model, list_models
     from mambaloc.models.mambaloc import LitMambaLoc
-    from mambaloc.zoo import create_transform, list_released, load
+    from mambaloc.zoo import create_model, create_transform, list_models, list_released, load
 
 __version__ = version("mambaloc")
 
@@ -22,9 +21,9 @@ __version__ = version("mambaloc")
 _EXPORTS = {
     "LitMambaLoc": "mambaloc.models.mambaloc",
     "PoseDataModule": "mambaloc.data",
-    "create_model": "mambaloc.models",
+    "create_model": "mambaloc.zoo",
     "create_transform": "mambaloc.zoo",
-    "list_models": "mambaloc.models",
+    "list_models": "mambaloc.zoo",
     "list_released": "mambaloc.zoo",
     "load": "mambaloc.zoo",
 }

@@ -108,9 +108,22 @@ def progress(items: Iterable[T], name: str, count: int) -> Iterable[T]:
     return track(items, f"{name:10}", count, transient=True)
 
 
+class _StderrLines(logging.Handler):
+    """Prints each message as a line on whatever ``sys.stderr`` is by then."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print it."""
+        print(self.format(record), file=sys.stderr, flush=True)
+
+
 def quieten() -> None:
-    """Keep what a user can act on: no hardware lists, tips, nor warnings about the insides of libraries."""
+    """Show the package's own log, and of libraries only what a user can act on: no hardware lists, no tips."""
     threading.excepthook = _show_unless_of_the_disk
+    own = logging.getLogger("mambaloc")
+    own.setLevel(logging.INFO)
+    own.propagate = False  # ONNX Runtime's tools give the root logger a handler: each line would come twice
+    if not any(isinstance(handler, _StderrLines) for handler in own.handlers):
+        own.addHandler(_StderrLines())
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", "LightningCLI's args parameter is intended")  # ours are made from sys.argv

@@ -12,9 +12,13 @@ MEASURED_WITH = ("mambaloc", "torch", "lightning", "timm", "numpy", "opencv-pyth
 
 
 def commit() -> str | None:
-    """Return this checkout's commit, ``+changes`` appended where tracked files differ; None outside a checkout."""
+    """Return this checkout's commit, ``+changes`` appended where tracked files differ; None outside a checkout.
+
+    An installation may lie in the folder of another project, whose commit says nothing of this package.
+    """
     git = ["git", "-C", str(Path(__file__).parent)]
     try:
+        subprocess.run([*git, "ls-files", "--error-unmatch", Path(__file__).name], capture_output=True, check=True)
         # `describe --dirty` would also do, but a tag must not stand in for the hash.
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
         changes = subprocess.run([*git, "diff", "--quiet", "HEAD"], capture_output=True, check=False).returncode

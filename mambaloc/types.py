@@ -29,17 +29,7 @@ from typing import Any
 
 from torch import Tensor
 
-
-@dataclass(frozen=True)
-class Pose:
-    """Rigid transform ``a_from_b``; as a camera pose, ``world_from_cam``.
-
-    Shape:
-        ``position_m`` is (..., 3) in metres, ``quaternion`` is (..., 4), unit, wxyz.
-    """
-
-    position_m: Tensor
-    quaternion: Tensor
+from mambaloc.geometry.poses import Pose as Pose
 
 
 @dataclass  # not frozen: Lightning fills a copy when it moves a batch to a device

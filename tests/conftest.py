@@ -186,7 +186,7 @@ def bundles_for_lenses(made_once, den):
         network = system.network
         network.head.position_scale.fit(data.train_position_m)
         network.default_intrinsics.copy_(data.train_intrinsics.median(dim=0).values)
-        write_bundle(system, data, folder / "tensors", formats, "web")
+        write_bundle(system, data, folder / "tensors", formats, "web", raw_input=False)
         with pytest.MonkeyPatch.context() as patch:  # the conversion takes seconds
             patch.setattr(onnx, "_write", lambda *_: shutil.copyfile(folder / "tensors/model.onnx", _[-1]))
             write_bundle(system, data, folder / "pictures", formats, "web", raw_input=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import time
 import warnings
 from dataclasses import asdict, replace
@@ -21,6 +22,8 @@ from mambaloc.mapping.building import POINTS, describe_points
 from mambaloc.mapping.posed import with_cameras
 from mambaloc.mapping.recipe import LEAST
 from mambaloc.runtime.maps import SparseMap
+
+_log = logging.getLogger(__name__)
 
 
 class MapBuild(L.Callback):
@@ -58,7 +61,7 @@ class MapBuild(L.Callback):
         settings = json.dumps(asdict(self.settings), sort_keys=True)
         digests = {"frames": frames.digest(), "settings": hashlib.sha256(settings.encode()).hexdigest()}
         if _is_made_from(path, digests):
-            print(f"{path}: is built from these frames already")
+            _log.info(f"{path}: is built from these frames already")
             return
         started = time.perf_counter()
         try:
@@ -69,11 +72,10 @@ class MapBuild(L.Callback):
             path.unlink(missing_ok=True)  # of other frames
             return
         replace(sparse_map, digests={**sparse_map.digests, **digests}).save(path)
-        print(
+        _log.info(
             f"{path}: {describe_points(sparse_map)}, in {len(sparse_map.key_poses)} key frames, "
             f"{path.stat().st_size / 2**20:.2f} MiB, built in {time.perf_counter() - started:.1f} s; "
-            "mambaloc localize localises with it already",
-            flush=True,
+            "mambaloc localize uses it."
         )
 
 

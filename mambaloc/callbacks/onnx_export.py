@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.export import contract_of_training, export_onnx, write_bundle
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.uncertainty import fit_uncertainty
+
+_log = logging.getLogger(__name__)
 
 
 class OnnxExport(L.Callback):
@@ -40,15 +43,16 @@ class OnnxExport(L.Callback):
             found = run / RUN_MAP if (run / RUN_MAP).is_file() else None
             written = write_bundle(system, data, run / "bundle", ("onnx",), sparse_map=found)
             model = written.deviations[0]
-            print(
-                f"{run / 'bundle'}: {'model and map' if found else 'model alone'}; the model is within "
-                f"{model.position_mm:.1e} mm and {model.rotation_deg:.1e} deg of PyTorch"
+            content = "model and map" if found else "model alone"
+            _log.info(
+                f"{run / 'bundle'}: {content}. The model is within {model.position_mm:.1e} mm and "
+                f"{model.rotation_deg:.1e} deg of PyTorch{'.' if written.unsure is None else f'; {written.unsure}'}"
             )
             return
         path = run / "model.onnx"
         try:
-            uncertainty, told = fit_uncertainty(system, data), "tells how sure it is"
+            uncertainty, outcome = fit_uncertainty(system, data), "with uncertainty."
         except InputError as error:
-            uncertainty, told = None, f"tells no uncertainty: {error}"
+            uncertainty, outcome = None, f"without uncertainty: {error}"
         parity = export_onnx(system, path, contract_of_training(system, data, uncertainty), uncertainty)
-        print(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch; {told}")
+        _log.info(f"{path}: within {parity.position_m:.1e} m and {parity.rotation_deg:.1e} deg of PyTorch, {outcome}")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import lightning as L
 
 from mambaloc.viz.views import draw_views
+
+_log = logging.getLogger(__name__)
 
 
 class ViewSheet(L.Callback):
@@ -31,4 +34,4 @@ class ViewSheet(L.Callback):
                 continue
             path = Path(trainer.default_root_dir) / ("views.png" if number is None else f"views_{number}.png")
             draw_views(made.source, made.views, made.quality, path, f"{made.kind} depth of {len(made.source)} frames")
-            print(f"{path}: {made.summary()}", flush=True)
+            _log.info(f"{path}: {made.summary()}")

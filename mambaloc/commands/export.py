@@ -1,5 +1,6 @@
 """Export for apps: mambaloc export CHECKPOINT_OR_ZOO_NAME [--to onnx,fp16,int8,ort] [--target android]."""
 
+from argparse import BooleanOptionalAction
 from pathlib import Path
 
 from mambaloc.console import OptionParser, exits_cleanly, quieten
@@ -17,7 +18,9 @@ def main() -> None:
     parser.add_argument("source", metavar="CHECKPOINT_OR_ZOO_NAME", help="RUN/checkpoints/best.ckpt, or ARCH.TAG")
     parser.add_argument("--to", default="onnx,fp16", help=f"of {', '.join(FORMATS)}, with commas")
     parser.add_argument("--target", default="android", choices=TARGETS, help="kind of app that INTEGRATION.md is about")
-    parser.add_argument("--raw-input", action="store_true", help="resize, crop and scale inside of the models")
+    parser.add_argument(
+        "--raw-input", action=BooleanOptionalAction, default=True, help="resize, crop and scale inside the models"
+    )
     maps = parser.add_mutually_exclusive_group()
     maps.add_argument("--map", type=Path, metavar="FILE", help="to ship beside the models; the run's unless given")
     maps.add_argument("--no-map", action="store_true", help="leave it out")

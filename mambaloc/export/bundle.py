@@ -61,7 +61,7 @@ def write_bundle(
     out: Path,
     formats: Sequence[str] = ("onnx", "fp16"),
     target: str = "android",
-    raw_input: bool = False,
+    raw_input: bool = True,
     sparse_map: Path | None = None,
 ) -> WrittenBundle:
     """Write a bundle's folder; it appears once every model in it has found the poses that the system finds.
@@ -74,7 +74,9 @@ def write_bundle(
         out: the folder, which must not be there yet.
         formats: of ``FORMATS``.
         target: of ``TARGETS``, which its page on integration is about.
-        raw_input: resize, crop and scale inside of the models, which then take RGB of any size.
+        raw_input: resize, crop and scale inside the models, which then take RGB of any size, as every page on
+            integration has it; otherwise they take what :class:`~mambaloc.runtime.contract.Preprocessing` makes of
+            an image.
         sparse_map: file of a map of the scene, which is copied into the bundle; of several scenes there is none.
 
     Raises:

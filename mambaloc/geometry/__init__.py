@@ -3,8 +3,7 @@
 from mambaloc.geometry.cameras import cropped_intrinsics, grid_rays, project, project_from_world, resized_intrinsics
 from mambaloc.geometry.homographies import rotation_homography, warped
 from mambaloc.geometry.poses import (
-    compose,
-    inverse,
+    Pose,
     matrix_from_pose,
     pose_from_matrix,
     position_error_m,
@@ -26,14 +25,13 @@ from mambaloc.geometry.rotations import (
 from mambaloc.geometry.solving import align_directions, intersect_rays
 
 __all__ = [
+    "Pose",
     "align_directions",
     "canonical",
-    "compose",
     "conjugate",
     "cropped_intrinsics",
     "grid_rays",
     "intersect_rays",
-    "inverse",
     "is_rotation",
     "log_from_quaternion",
     "matrix_from_pose",

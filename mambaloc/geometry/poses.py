@@ -1,4 +1,4 @@
-"""Rigid transforms: free functions over ``Pose``, batched and differentiable.
+"""Rigid transforms: ``Pose``, and functions over it, batched and differentiable.
 
 Convention
     Names read ``a_from_c = a_from_b @ b_from_c``: inner names cancel. Leading dimensions broadcast, so N points under
@@ -7,6 +7,8 @@ Convention
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -19,21 +21,30 @@ from mambaloc.geometry.rotations import (
     quaternion_from_matrix,
     rotate,
 )
-from mambaloc.types import Pose
 
 
-def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
-    """Chain two transforms into ``a_from_c``."""
-    return Pose(
-        position_m=transform(a_from_b, b_from_c.position_m),
-        quaternion=canonical(multiply(a_from_b.quaternion, b_from_c.quaternion)),
-    )
+@dataclass(frozen=True)
+class Pose:
+    """Rigid transform ``a_from_b``; as a camera pose, ``world_from_cam``.
 
+    Shape:
+        ``position_m`` is (..., 3) in metres, ``quaternion`` is (..., 4), unit, wxyz.
+    """
 
-def inverse(a_from_b: Pose) -> Pose:
-    """Turn ``a_from_b`` into ``b_from_a``."""
-    b_from_a = canonical(conjugate(a_from_b.quaternion))
-    return Pose(position_m=-rotate(b_from_a, a_from_b.position_m), quaternion=b_from_a)
+    position_m: Tensor
+    quaternion: Tensor
+
+    def __matmul__(self, b_from_c: Pose) -> Pose:
+        """Chain two transforms: ``a_from_c = a_from_b @ b_from_c``."""
+        return Pose(
+            position_m=transform(self, b_from_c.position_m),
+            quaternion=canonical(multiply(self.quaternion, b_from_c.quaternion)),
+        )
+
+    def inverse(self) -> Pose:
+        """Turn ``a_from_b`` into ``b_from_a``."""
+        b_from_a = canonical(conjugate(self.quaternion))
+        return Pose(position_m=-rotate(b_from_a, self.position_m), quaternion=b_from_a)
 
 
 def transform(a_from_b: Pose, points_b: Tensor) -> Tensor:

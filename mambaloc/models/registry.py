@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from fnmatch import fnmatch
 from typing import Any, TypeVar
@@ -17,16 +18,18 @@ _System = TypeVar("_System", bound=type[LitPoseRegressor])
 def register_model(name: str) -> Callable[[_System], _System]:
     """Class decorator that makes a system known by ``name``.
 
-    The same class again, as of a notebook's cell that is run twice, replaces the first.
+    A class of the same qualified name, as when a notebook's cell is run twice, replaces the first with a warning.
 
     Raises:
-        ValueError: where another class has the name.
+        ValueError: if another class has the name.
     """
 
     def register(cls: _System) -> _System:
         known = _MODELS.get(name)
         if known and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
             raise ValueError(f"model {name!r} is registered already, by {_MODELS[name].__qualname__}")
+        if known and known is not cls:
+            warnings.warn(f"model {name!r} is registered again. The new {cls.__qualname__} replaces it.", stacklevel=2)
         cls.registry_name = name
         _MODELS[name] = cls
         return cls
@@ -50,7 +53,8 @@ def model_class(name: str) -> type[LitPoseRegressor]:
     if name not in _MODELS:
         if "." in name:
             raise InputError(
-                f"unknown model {name!r}. Names with a dot are of trained models: use mambaloc.load({name!r})."
+                f"unknown model {name!r}. Names with a dot are of released models: "
+                f"use mambaloc.create_model({name!r}, pretrained=True)."
             )
         raise InputError(f"unknown model {name!r}. {suggestion(name, list_models())}")
     return _MODELS[name]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import re
+from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 from huggingface_hub import snapshot_download
 from safetensors import SafetensorError
@@ -12,7 +14,7 @@ from safetensors.torch import load as tensors_of
 
 from mambaloc.errors import InputError, suggestion
 from mambaloc.files import shipped_folders
-from mambaloc.models import Checkpoint, LitPoseRegressor, create_model
+from mambaloc.models import Checkpoint, LitPoseRegressor, registry
 from mambaloc.runtime.maps import MAP_FILE
 from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest
 
@@ -24,6 +26,36 @@ _SOURCES = "Sources are a checkpoint, 'ARCH.TAG', 'local-dir:FOLDER' and 'hf-hub
 def list_released() -> list[str]:
     """Names of the released models that are here, ``ARCH.TAG``, sorted."""
     return sorted({manifest.parent.name for zoo in _ZOOS for manifest in zoo.glob(f"*/{MANIFEST_FILE}")})
+
+
+def list_models(pattern: str = "*", pretrained: bool = False) -> list[str]:
+    """Names that match a wildcard, sorted.
+
+    Args:
+        pattern: such as ``"*loc*"``.
+        pretrained: list released models, ``ARCH.TAG``, in place of architectures.
+    """
+    if not pretrained:
+        return registry.list_models(pattern)
+    return [name for name in list_released() if fnmatch(name, pattern)]
+
+
+def create_model(name: str, pretrained: bool = False, **kwargs: Any) -> LitPoseRegressor:
+    """Build a model: untrained from its architecture's name, or with the weights of a released one.
+
+    Args:
+        name: an architecture of :func:`list_models`; with ``pretrained``, an ``ARCH.TAG``.
+        pretrained: load the released weights; the model is then in evaluation mode, as :func:`load` returns it.
+        kwargs: hyperparameters of an untrained model. A released model keeps its own.
+
+    Raises:
+        InputError: for an unknown name; for hyperparameters beside ``pretrained``; as :func:`load`.
+    """
+    if not pretrained:
+        return registry.create_model(name, **kwargs)
+    if kwargs:
+        raise InputError(f"{name}: a released model keeps its hyperparameters. Leave out {', '.join(kwargs)}.")
+    return load_released(released_folder(name))
 
 
 def load(source: str | Path) -> LitPoseRegressor:
@@ -72,7 +104,9 @@ def load_released(folder: Path) -> LitPoseRegressor:
     manifest, path = Manifest.read(folder), folder / WEIGHTS_FILE
     content = _released_bytes(path, manifest.weights_sha256)
     try:
-        system = create_model(manifest.model, **{**manifest.arguments, "backbone_weights": None, "warm_start": None})
+        system = registry.create_model(
+            manifest.model, **{**manifest.arguments, "backbone_weights": None, "warm_start": None}
+        )
         system.network.load_state_dict(tensors_of(content))
     except (SafetensorError, RuntimeError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[-1].strip()

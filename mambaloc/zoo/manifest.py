@@ -29,8 +29,8 @@ class Result:
         position_error_m: median.
         rotation_error_deg: median.
         seed: of the training.
-        commit: that was evaluated with.
-        device: likewise.
+        commit: of the checkout that evaluated it, or ``release VERSION`` of an installed package.
+        device: of the evaluation.
         seconds: of training alone.
     """
 

@@ -94,7 +94,7 @@ def card(name: str, manifest: Manifest) -> str:
     rows = "\n".join(
         f"| {r.data}{'' if r.official_split else ' (no official split)'}, {r.split}, {r.n} frames | {r.selection} | "
         f"{r.position_error_m:.3f} m | {r.rotation_error_deg:.2f}° | {r.seed} | {r.seconds:.0f} s | {r.device} | "
-        f"{r.commit[:7]} |"
+        f"{r.commit if r.commit.startswith('release') else r.commit[:7]} |"
         for r in manifest.results
     )
     trained = "\n".join(f"- {key}: {value}" for key, value in manifest.trained.items() if not isinstance(value, dict))
@@ -134,9 +134,9 @@ def _map(manifest: Manifest) -> str:
 
 def _result(measured: dict[str, Any]) -> Result:
     data, metrics, training = measured["data"], measured["metrics"], measured["training"]
-    commit, clock = measured["evaluation"]["commit"], training["wall_clock"]
-    if commit is None or clock is None:
-        raise InputError("no result without provenance: publish from a checkout, and a training of mambaloc train")
+    evaluation, clock = measured["evaluation"], training["wall_clock"]
+    if clock is None:
+        raise InputError("the checkpoint has no training time. Publish a checkpoint of mambaloc train.")
     return Result(
         data=f"{data['dataset']}/{data['scene']}",
         official_split=bool(data["official_split"]),
@@ -146,8 +146,8 @@ def _result(measured: dict[str, Any]) -> Result:
         position_error_m=round(metrics["position_error_m"], 6),
         rotation_error_deg=round(metrics["rotation_error_deg"], 6),
         seed=training["seed"],
-        commit=commit,
-        device=measured["evaluation"]["device"],
+        commit=evaluation["commit"] or f"release {evaluation['versions']['mambaloc']}",
+        device=evaluation["device"],
         seconds=round(clock["train_s"], 1),
     )
 

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
-from mambaloc.geometry import cropped_intrinsics, inverse, project, project_from_world, resized_intrinsics, transform
+from mambaloc.geometry import cropped_intrinsics, project, project_from_world, resized_intrinsics, transform
 from mambaloc.types import Pose
 
 K = torch.tensor([[585.0, 0, 320], [0, 570, 240], [0, 0, 1]], dtype=torch.float64)
@@ -24,7 +24,7 @@ def test_world_points_fall_where_opencv_projects_them():
     for seed in range(5):
         rotation, position_m = Rotation.random(random_state=seed), random(3, seed=seed) + 5
         quaternion = torch.from_numpy(rotation.as_quat(canonical=True)).roll(1)
-        pixels = project(transform(inverse(Pose(position_m, quaternion)), points_m), K)
+        pixels = project(transform(Pose(position_m, quaternion).inverse(), points_m), K)
         rvec = rotation.inv().as_rotvec()
         expected = cv2.projectPoints(points_m.numpy(), rvec, -rotation.inv().apply(position_m), K.numpy(), None)[0]
         np.testing.assert_allclose(pixels, expected[:, 0], rtol=1e-9, atol=1e-6)

@@ -10,8 +10,6 @@ from torch.testing import assert_close
 
 from mambaloc.geometry import (
     canonical,
-    compose,
-    inverse,
     matrix_from_pose,
     pose_from_matrix,
     position_error_m,
@@ -76,12 +74,12 @@ def test_pose_from_matrix_equals_scipy():
 
 def test_compose_is_the_matrix_product():
     a, b = random_pose(50, seed=1), random_pose(50, seed=2)
-    assert_close(matrix_from_pose(compose(a, b)), scipy_matrix(a) @ scipy_matrix(b))
+    assert_close(matrix_from_pose(a @ b), scipy_matrix(a) @ scipy_matrix(b))
 
 
 def test_inverse_is_the_matrix_inverse():
     pose = random_pose(50)
-    assert_close(matrix_from_pose(inverse(pose)), torch.linalg.inv(scipy_matrix(pose)))
+    assert_close(matrix_from_pose(pose.inverse()), torch.linalg.inv(scipy_matrix(pose)))
 
 
 def test_transform_is_the_matrix_on_homogeneous_points():
@@ -93,7 +91,7 @@ def test_transform_is_the_matrix_on_homogeneous_points():
 def test_camera_centre_is_the_position():
     world_from_cam = random_pose(50)
     assert_close(transform(world_from_cam, torch.zeros(3, dtype=F64)), world_from_cam.position_m)
-    assert_close(transform(inverse(world_from_cam), world_from_cam.position_m), torch.zeros(50, 3, dtype=F64))
+    assert_close(transform(world_from_cam.inverse(), world_from_cam.position_m), torch.zeros(50, 3, dtype=F64))
 
 
 # --- properties ------------------------------------------------------------------------------------------------------
@@ -102,22 +100,22 @@ def test_camera_centre_is_the_position():
 @fast
 @given(poses, poses, poses)
 def test_compose_is_associative(a: Pose, b: Pose, c: Pose):
-    assert_same(compose(compose(a, b), c), compose(a, compose(b, c)))
+    assert_same((a @ b) @ c, a @ (b @ c))
 
 
 @fast
 @given(poses)
 def test_inverse_cancels_on_both_sides(pose: Pose):
     identity = Pose(torch.zeros(3, dtype=F64), torch.eye(4, dtype=F64)[0])
-    assert_same(compose(pose, inverse(pose)), identity)
-    assert_same(compose(inverse(pose), pose), identity)
-    assert_same(inverse(inverse(pose)), pose)
+    assert_same(pose @ pose.inverse(), identity)
+    assert_same(pose.inverse() @ pose, identity)
+    assert_same(pose.inverse().inverse(), pose)
 
 
 @fast
 @given(poses, poses, coordinates)
 def test_transform_follows_composition(a: Pose, b: Pose, point: Tensor):
-    assert_close(transform(compose(a, b), point), transform(a, transform(b, point)), rtol=1e-9, atol=1e-9)
+    assert_close(transform(a @ b, point), transform(a, transform(b, point)), rtol=1e-9, atol=1e-9)
 
 
 @fast
@@ -130,9 +128,9 @@ def test_round_trip_through_a_matrix(pose: Pose):
 @given(poses, poses, st.floats(-5, 5).filter(lambda s: abs(s) > 0.1))
 def test_quaternion_length_and_sign_do_not_matter(a: Pose, b: Pose, scale: float):
     scaled = Pose(a.position_m, scale * a.quaternion)
-    assert_same(compose(scaled, b), compose(a, b))
-    assert_same(inverse(scaled), inverse(a))
-    for result in (compose(scaled, b), inverse(scaled), pose_from_matrix(matrix_from_pose(scaled))):
+    assert_same(scaled @ b, a @ b)
+    assert_same(scaled.inverse(), a.inverse())
+    for result in (scaled @ b, scaled.inverse(), pose_from_matrix(matrix_from_pose(scaled))):
         assert_unit_canonical(result)
 
 
@@ -140,7 +138,7 @@ def test_long_chains_do_not_drift():
     step = random_pose(1, dtype=F32)
     pose = step
     for _ in range(1000):
-        pose = compose(pose, step)
+        pose = pose @ step
     assert_close(torch.linalg.vector_norm(pose.quaternion, dim=-1), torch.ones(1), rtol=0, atol=2e-7)
 
 
@@ -169,8 +167,8 @@ def parts(pose: Pose) -> tuple[Tensor, Tensor]:
 
 POSE, OTHER, POINTS = parts(random_pose(4, seed=1)), parts(random_pose(4, seed=2)), random(4, 3, seed=3)
 CASES = {
-    "compose": (lambda p, q, r, s: parts(compose(Pose(p, q), Pose(r, s))), *POSE, *OTHER),
-    "inverse": (lambda p, q: parts(inverse(Pose(p, q))), *POSE),
+    "compose": (lambda p, q, r, s: parts(Pose(p, q) @ Pose(r, s)), *POSE, *OTHER),
+    "inverse": (lambda p, q: parts(Pose(p, q).inverse()), *POSE),
     "transform": (lambda p, q, x: transform(Pose(p, q), x), *POSE, POINTS),
     "matrix_from_pose": (lambda p, q: matrix_from_pose(Pose(p, q)), *POSE),
     "pose_from_matrix": (lambda m: parts(pose_from_matrix(m)), matrix_from_pose(Pose(*POSE))),
@@ -204,14 +202,14 @@ def test_points_broadcast_under_each_pose():
     apart = [transform(Pose(p, q), x) for p, q, x in zip(pose.position_m, pose.quaternion, points, strict=True)]
     assert_close(together, torch.stack(apart))
     one = random_pose(seed=7)
-    assert compose(one, pose).position_m.shape == (2, 3)
-    assert compose(one, pose).quaternion.shape == (2, 4)
+    assert (one @ pose).position_m.shape == (2, 3)
+    assert (one @ pose).quaternion.shape == (2, 4)
 
 
 class EveryFunction(torch.nn.Module):
     def forward(self, position_m: Tensor, quaternion: Tensor) -> tuple[Tensor, ...]:
         pose = Pose(position_m, quaternion)
-        chained = compose(pose, compose(pose, inverse(pose)))
+        chained = pose @ (pose @ pose.inverse())
         back = pose_from_matrix(matrix_from_pose(chained))
         return back.quaternion, transform(back, position_m), position_error_m(back.position_m, position_m)
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.callbacks import MapBuild, map_build
 from mambaloc.cli import main
+from mambaloc.console import quieten
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.capture import COLUMNS
 from mambaloc.errors import InputError, InputWarning
@@ -66,15 +67,15 @@ def capture(den, tmp_path):
 def test_it_is_built_from_the_frames_that_are_trained_on_and_no_others(den, tmp_path, capsys):
     data = data_of(den, validation="block", val_fraction=0.2, val_gap=2)  # of 32: 24 to train on, 6 to validate on
     run = run_of(data, tmp_path)
+    quieten()  # as tools do: the log goes to stderr
     capsys.readouterr()
     MapBuild(enabled=True, **SETTINGS).on_fit_start(run, None)
     built = SparseMap.load(tmp_path / "map/map.safetensors")
     assert frames_of(built, den) == list(range(24))
     assert built.scene == "den"
     assert built.digests["frames"] == data.chosen_training_frames().digest()
-    said = capsys.readouterr().out
-    assert said.startswith(f"{tmp_path}/map/map.safetensors: points triangulated: {len(built)}, in 24 key frames, ")
-    assert said.count("\n") == 1
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"{tmp_path}/map/map.safetensors: points triangulated: {len(built)}, in 24 key frames, ")
 
 
 def test_frames_that_are_thinned_away_are_not_in_it(den, tmp_path):
@@ -100,6 +101,7 @@ def test_other_ranks_and_trial_runs_build_none(changed, den, tmp_path):
 
 
 def test_a_resumed_run_keeps_its_map_unless_frames_or_settings_changed(den, tmp_path, monkeypatch, capsys):
+    quieten()
     built = []
     build = map_build.build_map
     monkeypatch.setattr(map_build, "build_map", lambda *args, **kwargs: built.append(args) or build(*args, **kwargs))
@@ -109,7 +111,7 @@ def test_a_resumed_run_keeps_its_map_unless_frames_or_settings_changed(den, tmp_
     start(SETTINGS)
     start(SETTINGS)
     assert len(built) == 1
-    assert "is built from these frames already" in capsys.readouterr().out
+    assert "is built from these frames already" in capsys.readouterr().err
     start({**SETTINGS, "key_frames": 20})
     assert len(built) == 2
     start({**SETTINGS, "key_frames": 20}, keep_every=2)
@@ -129,9 +131,9 @@ def test_a_resumed_command_leaves_the_file_alone(trained_with_map, tmp_path, cap
     main([str(recipe), *settings, "--ckpt_path", str(last), "--trainer.max_epochs", "2"])
     after = (run / "map/map.safetensors").stat()
     assert (before.st_ino, before.st_mtime_ns) == (after.st_ino, after.st_mtime_ns)
-    said = capsys.readouterr().out
-    assert f"{run}/map/map.safetensors: is built from these frames already" in said
-    assert "last and map" in said
+    output = capsys.readouterr()
+    assert f"{run}/map/map.safetensors: is built from these frames already" in output.err
+    assert "last and map" in output.out
 
 
 # --- where there can be none -----------------------------------------------------------------------------------------

@@ -24,8 +24,8 @@ def train(recipe, run, *options):
 def test_run_with_views_shows_and_tells_them_and_resumes_exactly(tiny_recipe, tmp_path, capsys):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     train(tiny_recipe, whole, "--trainer.max_epochs", "2")
-    said = capsys.readouterr().out
-    assert f"{whole / 'views.png'}: 16 views of 12 depth frames; correlation with real frames" in said
+    log = capsys.readouterr().err
+    assert f"{whole / 'views.png'}: 16 views of 12 depth frames; correlation with real frames" in log
     assert read_image(whole / "views.png").std() > 30
     told = json.loads((whole / "evaluation/last/metrics.json").read_text())["training"]["data"]["views"]
     assert {name: told[name] for name in ("count", "depth", "depth_frames", "share")} == {

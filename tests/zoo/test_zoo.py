@@ -224,3 +224,12 @@ def test_what_does_not_measure_the_same_is_not_released(run, tmp_path, monkeypat
     with pytest.raises(InputError, match="where the checkpoint's was"):
         publish(run / "checkpoints/best.ckpt", "tiny", tmp_path / "zoo", "cpu")
     assert not list((tmp_path / "zoo").iterdir())
+
+
+def test_an_installed_package_publishes_too(run, tmp_path, monkeypatch):
+    """Outside a checkout there is no commit: the result names the installed release."""
+    monkeypatch.setattr("mambaloc.provenance.commit", lambda: None)
+    folder = publish(run / "checkpoints/best.ckpt", "tiny", tmp_path, "cpu")
+    (result,) = Manifest.read(folder).results
+    assert result.commit == f"release {mambaloc.__version__}"
+    assert f"| {result.commit} |" in (folder / "README.md").read_text()

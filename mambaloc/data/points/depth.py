@@ -21,7 +21,7 @@ from rich.progress import track
 from mambaloc.data.frames import Cameras, Frames
 from mambaloc.data.points.scene_points import Points, ScenePoints, choose, frame_rng, stacked
 from mambaloc.errors import InputError
-from mambaloc.geometry import inverse, project, resized_intrinsics, transform
+from mambaloc.geometry import project, resized_intrinsics, transform
 from mambaloc.text import decode_text
 from mambaloc.types import Pose
 
@@ -152,7 +152,7 @@ def _lenders(frames: Frames, rows: list[int]) -> dict[int, NDArray[np.int64]]:
 
 def _in_view(points_m: Points, frames: Frames, cameras: Cameras, row: int) -> Points:
     """Those of the points that lie in front of a frame's camera and project into its picture."""
-    cam_from_world = inverse(_pose(frames, row))
+    cam_from_world = _pose(frames, row).inverse()
     points_cam = transform(cam_from_world, torch.from_numpy(points_m))
     pixels = project(points_cam, torch.from_numpy(cameras.intrinsics[row])).numpy()
     inside = ((pixels >= -0.5) & (pixels < cameras.size_px[row] - 0.5)).all(axis=1)
