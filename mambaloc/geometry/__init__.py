@@ -4,6 +4,8 @@ from mambaloc.geometry.cameras import cropped_intrinsics, grid_rays, project, pr
 from mambaloc.geometry.homographies import rotation_homography, warped
 from mambaloc.geometry.poses import (
     Pose,
+    compose,
+    inverse,
     matrix_from_pose,
     pose_from_matrix,
     position_error_m,
@@ -28,10 +30,12 @@ __all__ = [
     "Pose",
     "align_directions",
     "canonical",
+    "compose",
     "conjugate",
     "cropped_intrinsics",
     "grid_rays",
     "intersect_rays",
+    "inverse",
     "is_rotation",
     "log_from_quaternion",
     "matrix_from_pose",

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import deprecated
 
 from mambaloc.geometry.rotations import (
     canonical,
@@ -85,3 +86,15 @@ def position_error_m(a: Tensor, b: Tensor) -> Tensor:
         (..., 3), (..., 3) -> (...), metres.
     """
     return torch.linalg.vector_norm(a - b, dim=-1)
+
+
+@deprecated("Write a_from_b @ b_from_c.")
+def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
+    """Chain two transforms into ``a_from_c``. Deprecated: removed in the next release."""
+    return a_from_b @ b_from_c
+
+
+@deprecated("Write a_from_b.inverse().")
+def inverse(a_from_b: Pose) -> Pose:
+    """Turn ``a_from_b`` into ``b_from_a``. Deprecated: removed in the next release."""
+    return a_from_b.inverse()

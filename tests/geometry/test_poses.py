@@ -10,6 +10,8 @@ from torch.testing import assert_close
 
 from mambaloc.geometry import (
     canonical,
+    compose,
+    inverse,
     matrix_from_pose,
     pose_from_matrix,
     position_error_m,
@@ -80,6 +82,14 @@ def test_compose_is_the_matrix_product():
 def test_inverse_is_the_matrix_inverse():
     pose = random_pose(50)
     assert_close(matrix_from_pose(pose.inverse()), torch.linalg.inv(scipy_matrix(pose)))
+
+
+def test_the_functions_of_before_answer_alike_and_warn():
+    a, b = random_pose(3, seed=1), random_pose(3, seed=2)
+    with pytest.warns(DeprecationWarning, match="a_from_b @ b_from_c"):
+        assert_same(compose(a, b), a @ b)
+    with pytest.warns(DeprecationWarning, match=r"a_from_b\.inverse\(\)"):
+        assert_same(inverse(a), a.inverse())
 
 
 def test_transform_is_the_matrix_on_homogeneous_points():
