@@ -4,7 +4,7 @@
 # Seen:     its last argument is COLMAP's output, a vector of ImageScore, bound as an input: the list is copied, the copy is
 #           filled, the list stays as it was, and the method returns None. Nothing of the result reaches Python, though
 #           build, add, prepare and query all run without an error. Both overloads are bound like this.
-# Hurts:    users who retrieve images by COLMAP's vocabulary tree from Python, as to localise without matching every image.
+# Hurts:    users who retrieve images by COLMAP's vocabulary tree from Python, as to localize without matching every image.
 # Remedy:   compare descriptors otherwise, as by VLAD in NumPy, or run the colmap program's vocab_tree_retriever.
 set -euo pipefail
 work=$(mktemp -d)

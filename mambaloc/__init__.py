@@ -1,4 +1,4 @@
-"""Camera localisation that anyone can train for their own place.
+"""Camera localization that anyone can train for their own place.
 
 >>> import mambaloc
 >>> mambaloc.list_models()

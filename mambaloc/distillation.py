@@ -53,7 +53,7 @@ class Teacher:
 
     @torch.no_grad()
     def __call__(self, image: Tensor) -> Answers:
-        """Localise images, (B, 3, H, W) in 0..1."""
+        """Localize images, (B, 3, H, W) in 0..1."""
         network = self.system.to(image.device).network
         branches = network.forward_features(image)
         prediction = network.forward_head(branches)
@@ -176,7 +176,7 @@ class LitDistillation(LitStudent):
         answer = self.teacher(batch.image) if self.answers is None else self.answers.of(batch.index)
         terms = {
             "hard": lambda: self.loss(prediction, batch),
-            "soft": lambda: self.distillation.soft(self._normalised(prediction), self._normalised(answer.prediction)),
+            "soft": lambda: self.distillation.soft(self._normalized(prediction), self._normalized(answer.prediction)),
             "feature": lambda: cosine_distance(self.distillation.projection(latent_BD), answer.feature),
         }
         loss = torch.zeros((), device=self.device)
@@ -188,8 +188,8 @@ class LitDistillation(LitStudent):
         self._log_train("loss", loss, batch)
         return loss
 
-    def _normalised(self, prediction: PosePrediction) -> PosePrediction:
-        return replace(prediction, position_m=self.network.head.position_scale.normalise(prediction.position_m))
+    def _normalized(self, prediction: PosePrediction) -> PosePrediction:
+        return replace(prediction, position_m=self.network.head.position_scale.normalize(prediction.position_m))
 
     def _log_train(self, name: str, value: Tensor, batch: PoseBatch) -> None:
         self.log(f"train/{name}", value, on_step=False, on_epoch=True, batch_size=len(batch.index), sync_dist=True)

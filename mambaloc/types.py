@@ -92,7 +92,7 @@ class CellPrediction:
 
 @dataclass  # not frozen, as PoseBatch
 class PosePrediction:
-    """What a localiser says of a batch of images.
+    """What a localizer says of a batch of images.
 
     Shape:
         ``position_m`` (B, 3) in metres. ``quaternion`` (B, 4) as the network regressed it: the loss and the

@@ -1,4 +1,4 @@
-"""How far off a pose may be, and whether its image shows the place at all: told in the pass that localises.
+"""How far off a pose may be, and whether its image shows the place at all: told in the pass that localizes.
 
 An image is compared with training images in what the backbone sees of it as a whole. The farther the nearest one, the
 larger the error: how much larger is measured on frames held out of training, by split conformal prediction (Lei et al.
@@ -199,8 +199,8 @@ def _together(scenes: list[ErrorsByDistance]) -> ErrorsByDistance:
     """Frames of all scenes whose scene was recognised: of the others the errors are infinite."""
     parts = [(each.distance, each.position_error_m, each.rotation_error_deg) for each in scenes]
     distance, position_m, rotation_deg = (torch.cat(each) for each in zip(*parts, strict=True))
-    is_recognised = position_m.isfinite()
-    return ErrorsByDistance(*(each[is_recognised] for each in (distance, position_m, rotation_deg)))
+    is_recognized = position_m.isfinite()
+    return ErrorsByDistance(*(each[is_recognized] for each in (distance, position_m, rotation_deg)))
 
 
 def _check_held_out(data: PoseDataModule, trained_on: str | None) -> None:
@@ -223,7 +223,7 @@ def _check_held_out(data: PoseDataModule, trained_on: str | None) -> None:
 def errors_by_distance(
     network: PoseNetwork, head: UncertaintyHead, data: PoseDataModule, part: Split
 ) -> ErrorsByDistance:
-    """Localise the centre crops of a part's frames.
+    """Localize the centre crops of a part's frames.
 
     Args:
         network: in evaluation mode, on the CPU.
@@ -233,12 +233,12 @@ def errors_by_distance(
     """
     distances: list[Tensor] = []
 
-    def localise(image: Tensor, intrinsics: Tensor | None) -> PosePrediction:
+    def localize(image: Tensor, intrinsics: Tensor | None) -> PosePrediction:
         feats = network.forward_backbone(image)
         distances.append(head.distance(pooled(feats)))
         return network.forward_head(network.features(feats), intrinsics)
 
-    table = error_table(localise, data.batches(part))
+    table = error_table(localize, data.batches(part))
     return ErrorsByDistance(torch.cat(distances), table.position_error_m, table.rotation_error_deg)
 
 

@@ -11,13 +11,13 @@ from scipy.spatial.distance import cdist
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.export.precision import half_precision
 from mambaloc.images import read_image, resized
 from mambaloc.models.student import LitStudent
 from mambaloc.nn import Backbone, PooledBackbone
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 from mambaloc.uncertainty import (
     LEVEL,
     ErrorsByDistance,
@@ -178,7 +178,7 @@ def test_held_out_frames_set_the_radii(scenes):
 def test_errors_are_those_of_an_evaluation(scenes):
     system, data = as_if_trained(student().eval(), scene(scenes))
     head = fit_uncertainty(system, data)
-    table = localise_test_frames(system, data, "cpu")
+    table = localize_test_frames(system, data, "cpu")
     found = errors_by_distance(system.network.eval(), head, data, "test")
     torch.testing.assert_close(found.position_error_m, table.position_error_m, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(found.rotation_error_deg, table.rotation_error_deg, rtol=1e-3, atol=1e-2)
@@ -246,13 +246,13 @@ def exported(scenes, tmp_path_factory):
 
 
 @torch.no_grad()
-def test_the_localiser_tells_what_the_head_tells(exported):
+def test_the_localizer_tells_what_the_head_tells(exported):
     system, data, head, path = exported
-    localiser = Localiser(path, 1)
-    assert localiser.contract.uncertainty == {"level": 0.9, "held_out_frames": 12}
+    localizer = Localizer(path, 1)
+    assert localizer.contract.uncertainty == {"level": 0.9, "held_out_frames": 12}
     for frame, batch in zip(data.frames("test").image_paths, data.batches("test", size=1), strict=True):
         metres, degrees, unfamiliarity = head(pooled(system.network.backbone(batch.image)))
-        found = localiser.localise(frame)
+        found = localizer.localize(frame)
         assert found.position_radius_m == pytest.approx(metres.item(), rel=1e-3)
         assert found.rotation_radius_deg == pytest.approx(degrees.item(), rel=1e-3)
         assert found.unfamiliarity == pytest.approx(unfamiliarity.item(), rel=1e-3)
@@ -267,7 +267,7 @@ def test_half_precision_tells_nearly_the_same(exported, tmp_path):
     assert onnx.TensorProto.FLOAT not in weights.values()  # the way to the radii keeps no convolution exact
     onnx.save(half, tmp_path / "half.onnx")
     for frame in data.frames("test").image_paths:
-        exact, rounded = (Localiser(each, 1).localise(frame) for each in (path, tmp_path / "half.onnx"))
+        exact, rounded = (Localizer(each, 1).localize(frame) for each in (path, tmp_path / "half.onnx"))
         assert rounded.position_radius_m == pytest.approx(exact.position_radius_m, rel=0.02)
         assert rounded.unfamiliarity == pytest.approx(exact.unfamiliarity, rel=0.02)
 
@@ -279,11 +279,11 @@ def test_a_contract_of_another_model_is_refused(exported, tmp_path):
         entry.value = contract_of(system, data.hparams).to_json()
     onnx.save(model, tmp_path / "model.onnx")
     with pytest.raises(InputError, match=r"says \['position_m', .* as its contract does not; export it anew"):
-        Localiser(tmp_path / "model.onnx")
+        Localizer(tmp_path / "model.onnx")
 
 
 def test_a_model_that_cannot_tell_is_never_in_doubt(exported, bundle_of_tensors):
     _, data, _, _ = exported
-    found = Localiser(bundle_of_tensors / "model.onnx", 1).localise(data.frames("test").image_paths[0])
+    found = Localizer(bundle_of_tensors / "model.onnx", 1).localize(data.frames("test").image_paths[0])
     assert (found.position_radius_m, found.rotation_radius_deg, found.unfamiliarity) == (None, None, None)
     assert not found.is_unfamiliar

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mambaloc.bags.reading import import_rosbags
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, whole_folder, writing
-from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.maps.radii import covariance_radius
 from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix
 
@@ -88,7 +88,7 @@ def _message(types: Any, world: str, ns: int, position: Matrix, quaternion: Matr
     return of[_TYPE](header(**ros1, stamp=stamp, frame_id=world), with_covariance)
 
 
-def covariance_of(pose: Localisation) -> Matrix | None:
+def covariance_of(pose: Localization) -> Matrix | None:
     """The covariance (6, 6) of a pose, in metres and radians about the world's axes, as ROS has it.
 
     The map's where it has one. Otherwise of a normal error, the same in every direction, that is within the radii as

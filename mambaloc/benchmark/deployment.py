@@ -21,11 +21,11 @@ from torch import Tensor
 from mambaloc.benchmark.latency import in_turns
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.export.precision import half_precision
 from mambaloc.export.quantisation import eight_bit, median_errors
-from mambaloc.metrics import summarise
+from mambaloc.metrics import summarize
 from mambaloc.models import LitPoseRegressor
 from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT
 
@@ -135,7 +135,7 @@ def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict
     feeds = {IMAGE_INPUT: image.numpy()}
     if system.network.takes_intrinsics:
         feeds[INTRINSICS_INPUT] = system.network.default_intrinsics[None].numpy()
-    said = summarise(localise_test_frames(system, data, "cpu"))
+    said = summarize(localize_test_frames(system, data, "cpu"))
     return {
         "PyTorch": _Form(weights.tell(), _eager(system, image), _medians(said)),
         "float32": _on_onnx_runtime(exported, feeds, threads, _medians(median_errors(exported, data))),

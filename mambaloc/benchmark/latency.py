@@ -144,9 +144,9 @@ def in_turns(calls: Sequence[Callable[[], object]], repetitions: int, device: st
 
 
 def _timed(call: Callable[[], object], device: str) -> float:
-    synchronise = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None)
-    synchronise()
+    synchronize = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None)
+    synchronize()
     start = time.perf_counter()
     call()
-    synchronise()
+    synchronize()
     return time.perf_counter() - start

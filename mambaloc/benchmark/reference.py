@@ -95,7 +95,7 @@ class PublishedTransPoseNet(nn.Module):
         self.head = network.head
 
     def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
+        """Localize images."""
         stride8_BCHW, stride16_BCHW = self.backbone(image)[2:4]
         position_BD, orientation_BD = (
             _select(gis, encoder(feats))
@@ -166,7 +166,7 @@ class PublishedAtLoc(nn.Module):
         self.gis = nn.ModuleList((network.first_gis, network.second_gis))
 
     def forward(self, image: Tensor) -> PosePrediction:
-        """Localise images."""
+        """Localize images."""
         feats_BD, attention = F.relu(self.backbone(image)), self.attention
         phi_BE1, theta_B1E = attention.phi(feats_BD).unsqueeze(2), attention.theta(feats_BD).unsqueeze(1)
         weights_BEE = F.softmax(torch.matmul(phi_BE1, theta_B1E), dim=-1)

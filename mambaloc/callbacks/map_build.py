@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 class MapBuild(L.Callback):
     """Build a sparse map of the frames that the network trains on, in ``RUN/map/map.safetensors``.
 
-    That is before the first epoch, so that seconds after the start there is something to localise with. Frames that are
+    That is before the first epoch, so that seconds after the start there is something to localize with. Frames that are
     held out for validation are not in it. A resumed run keeps its map, unless frames or settings have changed. Where
     cameras are unknown, or the frames give no map, a line says so and the training goes on.
 

@@ -1,4 +1,4 @@
-"""Localise in a browser: mambaloc demo [BUNDLE] [--port 8000] [--lan] [--film VIDEO] [--out FOLDER]."""
+"""Localize in a browser: mambaloc demo [BUNDLE] [--port 8000] [--lan] [--film VIDEO] [--out FOLDER]."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Localise pictures: mambaloc localize [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA_OR_BAG [--filter causal|smooth]."""
+"""Localize pictures: mambaloc localize [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA_OR_BAG [--filter causal|smooth]."""
 
 from argparse import Namespace
 from collections.abc import Iterator
@@ -14,8 +14,8 @@ from mambaloc.bags.writing import TOPIC
 from mambaloc.console import OptionParser, black_and_white, exits_cleanly, pinhole_matrix, thread_count
 from mambaloc.errors import InputError
 from mambaloc.images import Image
-from mambaloc.runtime import Localiser
-from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime import Localizer
+from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.sources import SourceFrame
 from mambaloc.runtime.video import FILTERS, Followed, follow
 from mambaloc.viz.rerun_recording import RerunRecording, rerun_recording
@@ -23,7 +23,7 @@ from mambaloc.viz.rerun_recording import RerunRecording, rerun_recording
 
 @exits_cleanly
 def main() -> None:
-    """Localise every frame and write a trajectory; Ctrl-C ends a camera's."""
+    """Localize every frame and write a trajectory; Ctrl-C ends a camera's."""
     parser = OptionParser(description=__doc__)
     parser.add_argument(
         "model",
@@ -72,42 +72,42 @@ def main() -> None:
     )
     parser.add_argument("--threads", type=thread_count, help="that the network may use for one image")
     args = parser.parse_args()
-    localiser = Localiser(_model(args.model), args.threads, args.sparse_map)
+    localizer = Localizer(_model(args.model), args.threads, args.sparse_map)
     if not is_bag(Path(args.source)) and (args.topic or args.world_frame or args.pose_frame):
         raise InputError(f"{args.source}: is no ROS bag. Leave --topic, --world-frame and --pose-frame out.")
-    with _recording(localiser, args.rerun) as recording:
+    with _recording(localizer, args.rerun) as recording:
         if is_bag(Path(args.source)):
-            said = _localise_bag(localiser, args, recording)
+            said = _localize_bag(localizer, args, recording)
         else:
-            said = f"{args.out}: {_localise_frames(localiser, args, recording)}"
+            said = f"{args.out}: {_localize_frames(localizer, args, recording)}"
     print(said)
     if args.rerun is not None:
         print(f"{args.rerun}: open it with rerun {args.rerun}")
 
 
 @contextmanager
-def _recording(localiser: Localiser, path: Path | None) -> Iterator[RerunRecording | None]:
+def _recording(localizer: Localizer, path: Path | None) -> Iterator[RerunRecording | None]:
     if path is None:
         yield None
         return
-    with rerun_recording(path, localiser.scene, localiser.world) as recording:
-        if localiser.sparse_map is not None:
-            recording.add_map(localiser.sparse_map)
+    with rerun_recording(path, localizer.scene, localizer.world) as recording:
+        if localizer.sparse_map is not None:
+            recording.add_map(localizer.sparse_map)
         yield recording
 
 
-def _localise_frames(localiser: Localiser, args: Namespace, recording: RerunRecording | None) -> Followed:
-    def record(frame: SourceFrame, pose: Localisation) -> None:
+def _localize_frames(localizer: Localizer, args: Namespace, recording: RerunRecording | None) -> Followed:
+    def record(frame: SourceFrame, pose: Localization) -> None:
         image, matrix = frame.image, args.intrinsics
         if args.distorted:
-            image, matrix = localiser.undistortion.apply(image, args.source)
+            image, matrix = localizer.undistortion.apply(image, args.source)
         elif matrix is None:
-            matrix = localiser.intrinsics_of((image.shape[1], image.shape[0]))
+            matrix = localizer.intrinsics_of((image.shape[1], image.shape[0]))
         assert recording is not None
         recording.add_frame(image, pose, frame.time_s, matrix)
 
     return follow(
-        localiser,
+        localizer,
         args.source,
         args.out,
         args.filter,
@@ -118,8 +118,8 @@ def _localise_frames(localiser: Localiser, args: Namespace, recording: RerunReco
     )
 
 
-def _localise_bag(localiser: Localiser, args: Namespace, recording: RerunRecording | None) -> str:
-    from mambaloc.bags.localising import localise_bag  # only here: an extra
+def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecording | None) -> str:
+    from mambaloc.bags.localizing import localize_bag  # only here: an extra
     from mambaloc.importing.formats.ros_bag import straightener
 
     if args.distorted:
@@ -129,13 +129,13 @@ def _localise_bag(localiser: Localiser, args: Namespace, recording: RerunRecordi
     if args.out.suffix == ".tum":
         raise InputError(f"--out {args.out}: a bag's poses go into a bag. Give --out FILE.bag, or a folder for ROS 2.")
 
-    def record(picture: Picture, image: Image, matrix: ArrayLike | None, pose: Localisation) -> None:
+    def record(picture: Picture, image: Image, matrix: ArrayLike | None, pose: Localization) -> None:
         assert recording is not None
-        own = localiser.intrinsics_of((image.shape[1], image.shape[0])) if matrix is None else matrix
+        own = localizer.intrinsics_of((image.shape[1], image.shape[0])) if matrix is None else matrix
         recording.add_frame(image, pose, np.datetime64(picture.ns, "ns"), own)
 
-    said = localise_bag(
-        localiser,
+    said = localize_bag(
+        localizer,
         Path(args.source),
         args.out,
         straightener,

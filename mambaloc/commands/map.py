@@ -23,7 +23,7 @@ from mambaloc.mapping.growing import add_frames, remove_session
 from mambaloc.mapping.new_frames import read_new_frames
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import LEAST, recipe_of
-from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import MAP_FILE, MapLocalizer, SparseMap
 from mambaloc.viz.coverage import write_coverage
 from mambaloc.viz.matches import write_points
 
@@ -72,7 +72,7 @@ def _change(args: argparse.Namespace) -> None:
     test = read_frames(recipe, "test") if recipe else None
     frames, settings = [], {}
     if args.add:
-        frames = read_new_frames(args.add, MapLocaliser(before), args.intrinsics, args.distorted)
+        frames = read_new_frames(args.add, MapLocalizer(before), args.intrinsics, args.distorted)
         settings = {"key_frames": args.frames or MapSettings.key_frames, "most_bytes": MapSettings.most_bytes}
     cpu = time.process_time()
     if args.add:

@@ -16,7 +16,7 @@ def main() -> None:
         "--host", default="127.0.0.1", help="address to listen at; any but this machine's needs a token"
     )
     parser.add_argument("--port", type=whole_number(0, 65535), default=8000, help="0 takes a free one")
-    parser.add_argument("--workers", type=whole_number(1, 256), default=os.cpu_count(), help="processes that localise")
+    parser.add_argument("--workers", type=whole_number(1, 256), default=os.cpu_count(), help="processes that localize")
     parser.add_argument("--token-file", type=Path, help="file of the token that requests must carry")
     parser.add_argument("--megabytes", type=whole_number(1, 1024), default=32, help="largest body of a request")
     parser.add_argument(

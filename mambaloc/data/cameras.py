@@ -55,11 +55,11 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
     if "intrinsics_px" in (note := scene_note(folder)):
         return _alike(_of_rendering(folder, note["intrinsics_px"]), size, frames)
     if dataset == "7scenes":
-        return _alike(_centred(_SEVEN_SCENES_FOCAL * width, size), size, frames)
+        return _alike(_centered(_SEVEN_SCENES_FOCAL * width, size), size, frames)
     if nvm.is_file():
         cameras = read_nvm_cameras(nvm)
         focal_px = zip(cameras.names, cameras.focal_px, strict=True)
-        return _of_model({name: _centred(focal, size) for name, focal in focal_px}, nvm, folder, size, frames)
+        return _of_model({name: _centered(focal, size) for name, focal in focal_px}, nvm, folder, size, frames)
     if colmap:
         return _of_model(_of_colmap(colmap, size), colmap, folder, size, frames)
     raise UnknownCameraError(
@@ -93,7 +93,7 @@ def known_or_assumed_cameras(dataset: str, folder: Path, frames: Frames) -> Came
 
 def assumed_intrinsics(size: Size) -> Floats:
     """The usual camera's pinhole matrix, (3, 3), for pictures of a size (width, height)."""
-    return _centred(ASSUMED_FOCAL * max(size), size)
+    return _centered(ASSUMED_FOCAL * max(size), size)
 
 
 def undistortion_of(folder: Path) -> Undistortion:
@@ -121,7 +121,7 @@ def undistortion_of(folder: Path) -> Undistortion:
         raise InputError(f"{folder / SCENE_FILE}: {error}. Correct it, or import the scene again.") from None
 
 
-def _centred(focal_px: float, size: Size) -> Floats:
+def _centered(focal_px: float, size: Size) -> Floats:
     return _pinhole(focal_px, focal_px, (size[0] - 1) / 2, (size[1] - 1) / 2)
 
 

@@ -108,9 +108,9 @@ def pinhole_of(camera: Any, size_px: tuple[int, int]) -> NDArray[np.float64]:
     Of a distorted camera model the pinhole part is taken. COLMAP counts from the corner of the top-left pixel.
     """
     scale_x, scale_y = size_px[0] / camera.width, size_px[1] / camera.height
-    centre = (camera.principal_point_x * scale_x - CORNER_PX, camera.principal_point_y * scale_y - CORNER_PX)
+    center = (camera.principal_point_x * scale_x - CORNER_PX, camera.principal_point_y * scale_y - CORNER_PX)
     focal = (camera.focal_length_x * scale_x, camera.focal_length_y * scale_y)
-    return np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
+    return np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
 
 
 def _is_whole(name: str, data: bytes) -> bool:

@@ -40,7 +40,7 @@ class NvmCameras:
     names: list[str]
     focal_px: NDArray[np.float64]
     cam_from_world: NDArray[np.float64]
-    centre_m: NDArray[np.float64]
+    center_m: NDArray[np.float64]
 
 
 def read_nvm_cameras(path: Path) -> NvmCameras:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation.evaluate import median_intervals
-from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.evaluation.trained import Trained
-from mambaloc.metrics import PoseErrorTable, summarise
+from mambaloc.metrics import PoseErrorTable, summarize
 from mambaloc.viz.curves import Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
 from mambaloc.viz.png import write_png
 
@@ -24,7 +24,7 @@ _ERRORS = {"position_error_m": "position error (m)", "rotation_error_deg": "rota
 def draw_cumulative(trained: Sequence[Trained], path: Path, title: str) -> None:
     """Draw the share of test frames whose error is at most so large; a line a system, all its checkpoints together."""
     tables = {
-        name: [localise_test_frames(each.system, each.data) for each in of] for name, of in _by_name(trained).items()
+        name: [localize_test_frames(each.system, each.data) for each in of] for name, of in _by_name(trained).items()
     }
 
     def draw(axes: Axes, error: str) -> None:
@@ -99,8 +99,8 @@ def _training_frames(trained: Trained) -> int:
 
 def _points(trained: Trained, frames: int) -> dict[str, Point]:
     """Both medians with their intervals."""
-    table = localise_test_frames(trained.system, trained.data)
-    medians, intervals = summarise(table), median_intervals(table, trained.data.frames("test").sequences)
+    table = localize_test_frames(trained.system, trained.data)
+    medians, intervals = summarize(table), median_intervals(table, trained.data.frames("test").sequences)
     return {error: Point(frames, medians[error], *intervals[error]) for error in _ERRORS}
 
 

@@ -14,14 +14,14 @@ from mambaloc import provenance
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import BLOCK, LEVEL, block_resamples, median_interval
-from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.evaluation.recording import record_test_frames
 from mambaloc.evaluation.references import frozen_features, median_training_pose, nearest_training_pose, retrieval
 from mambaloc.evaluation.trained import Trained, load_trained
 from mambaloc.evaluation.trajectories import write_predictions
 from mambaloc.evaluation.with_map import Answers, MeasuredMap
 from mambaloc.files import whole_file, writing
-from mambaloc.metrics import PoseErrorTable, summarise
+from mambaloc.metrics import PoseErrorTable, summarize
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.models.weights import mib, parameter_count
 from mambaloc.nn import PooledBackbone
@@ -40,7 +40,7 @@ def evaluate_checkpoint(
     beside: MeasuredMap | None = None,
     rerun: Path | None = None,
 ) -> dict[str, Any]:
-    """Localise every test frame with a checkpoint and write the result to a folder.
+    """Localize every test frame with a checkpoint and write the result to a folder.
 
     Writes ``metrics.json``, ``predictions.csv``, ``predictions.tum``, ``ground_truth.tum`` and ``trajectory.png``; with
     a map also ``predictions_both.csv`` and ``predictions_both.tum``, of both together.
@@ -67,11 +67,11 @@ def evaluate_checkpoint(
     system, data = trained.system, trained.data
     backbone = _first_backbone(checkpoint) if with_retrieval else None
     started = time.perf_counter()
-    table = localise_test_frames(system, data, accelerator)
+    table = localize_test_frames(system, data, accelerator)
     seconds = time.perf_counter() - started
     both = beside.beside(table, lambda: uncertainty_of_test(system, data)) if beside else None
     result = {
-        "metrics": summarise(table),
+        "metrics": summarize(table),
         **({} if data.scene_index is None else {"recognised": table.position_error_m.isfinite().float().mean().item()}),
         "count": len(table.index),
         "data": data.describe(),

@@ -11,7 +11,7 @@ import torch
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.curves import draw_cumulative, draw_sparsity, draw_time
-from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.evaluation.trained import Trained
 from mambaloc.files import writing
 from mambaloc.geometry import position_error_m, rotation_error_deg
@@ -55,7 +55,7 @@ def _trajectory(trained: Sequence[Trained], out: Path, frames: int) -> list[Path
     """A picture and a page a system, of every test frame."""
     written = []
     for number, each in enumerate(trained, start=1):
-        table, told = localise_test_frames(each.system, each.data), each.data.frames("test")
+        table, told = localize_test_frames(each.system, each.data), each.data.frames("test")
         stem = "trajectory" if len(trained) == 1 else f"trajectory_{number}"
         picture, page = out / f"{stem}.png", out / f"{stem}.html"
         title = f"{each.name}, {each.run}\n{_where(each.data)}"

@@ -12,8 +12,8 @@ from mambaloc.models import LitPoseRegressor
 
 
 @torch.inference_mode()
-def localise_test_frames(system: LitPoseRegressor, data: PoseDataModule, accelerator: str = "auto") -> PoseErrorTable:
-    """Let a system localise every test frame, once and on one device.
+def localize_test_frames(system: LitPoseRegressor, data: PoseDataModule, accelerator: str = "auto") -> PoseErrorTable:
+    """Let a system localize every test frame, once and on one device.
 
     Args:
         system: trained; it ends in evaluation mode on that device.

@@ -12,7 +12,7 @@ from mambaloc.evaluation.trained import Trained
 from mambaloc.evaluation.with_map import Answers, MeasuredMap
 from mambaloc.images import read_image
 from mambaloc.metrics import PoseErrorTable
-from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.localization import Localization
 from mambaloc.uncertainty import uncertainty_of_test
 from mambaloc.viz.rerun_recording import rerun_recording
 
@@ -35,14 +35,14 @@ def record_test_frames(
         InputError: as :func:`~mambaloc.viz.rerun_recording.rerun_recording`, or for a bad picture.
     """
     frames, scene = trained.data.frames("test"), trained.data.hparams["scene"]
-    poses: Sequence[Localisation] = _network(trained, table) if both is None else both.poses
+    poses: Sequence[Localization] = _network(trained, table) if both is None else both.poses
     try:
         cameras = list(frame_intrinsics(trained.data.hparams["dataset"], trained.data.folder, frames))
     except InputError:
         cameras = []
     with rerun_recording(path, str(scene)) as recording:
         if beside is not None:
-            recording.add_map(beside.localiser.map)
+            recording.add_map(beside.localizer.map)
         for number, pose in enumerate(poses):
             index = int(table.index[number])
             recording.add_frame(
@@ -54,9 +54,9 @@ def record_test_frames(
             )
 
 
-def _network(trained: Trained, table: PoseErrorTable) -> list[Localisation]:
+def _network(trained: Trained, table: PoseErrorTable) -> list[Localization]:
     """A network's poses, each with its radii."""
     stated = uncertainty_of_test(trained.system, trained.data)
     radii = itertools.repeat((None, None, None)) if stated is None else stated.by_frame()
     poses = zip(table.predicted_position_m.cpu().numpy(), table.predicted_quaternion.cpu().numpy(), strict=True)
-    return [Localisation(*pose, 0.0, *three) for pose, three in zip(poses, radii, strict=False)]
+    return [Localization(*pose, 0.0, *three) for pose, three in zip(poses, radii, strict=False)]

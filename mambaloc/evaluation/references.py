@@ -1,4 +1,4 @@
-"""What any localiser must beat: answers that need no network."""
+"""What any localizer must beat: answers that need no network."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ def evaluate_scenes(
     accelerator: str = "auto",
     with_retrieval: bool = False,
 ) -> dict[str, dict[str, Any]]:
-    """Localise every test frame of every scene, each scene's result in a folder of its own below ``out``.
+    """Localize every test frame of every scene, each scene's result in a folder of its own below ``out``.
 
     The network is not told which scene a frame is of. Where it takes a frame for another scene's, the errors are
     infinite, and means leave it out.

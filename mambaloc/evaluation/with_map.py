@@ -1,4 +1,4 @@
-"""Test frames localised in a sparse map: alone, and beside a network."""
+"""Test frames localized in a sparse map: alone, and beside a network."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mambaloc.data import Frames, PoseDataModule
 from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.files import sha256
-from mambaloc.mapping.evaluating import MapErrors, covers, localise_frames
+from mambaloc.mapping.evaluating import MapErrors, covers, localize_frames
 from mambaloc.metrics import PoseErrorTable
-from mambaloc.runtime.localisation import Localisation, combined
-from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
+from mambaloc.runtime.localization import Localization, combined
+from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalization, MapLocalizer, SparseMap
 from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
 from mambaloc.uncertainty import Uncertainty
 
@@ -48,17 +48,17 @@ class Answers:
     is_accepted: NDArray[np.bool_]
     is_covered: NDArray[np.bool_]
     cpu_s: Floats
-    poses: list[Localisation]
+    poses: list[Localization]
 
     @classmethod
-    def of(cls, found: Sequence[MapLocalisation | Localisation], frames: Frames, cpu_s: Floats) -> Self:
+    def of(cls, found: Sequence[MapLocalization | Localization], frames: Frames, cpu_s: Floats) -> Self:
         """Compare answers with the frames' true poses."""
         truths = rigid_transforms(matrix_from_quaternion(frames.quaternion), frames.position_m)
         pairs = zip(found, truths, strict=True)
         covered = [covers(it.position_m, it.quaternion, it.covariance, truth) for it, truth in pairs]
-        sources = ["map" if isinstance(it, MapLocalisation) else str(it.source) for it in found]
+        sources = ["map" if isinstance(it, MapLocalization) else str(it.source) for it in found]
         is_accepted = np.array([it.is_accepted for it in found])
-        poses = [it for it in found if isinstance(it, Localisation)]
+        poses = [it for it in found if isinstance(it, Localization)]
         return cls(_table(found, frames), sources, is_accepted, np.array(covered), cpu_s, poses)
 
     def summary(self) -> dict[str, float]:
@@ -69,24 +69,24 @@ class Answers:
 
 @dataclass(frozen=True)
 class MeasuredMap:
-    """A sparse map, and test frames that were localised in it alone; :func:`measure_map` makes it.
+    """A sparse map, and test frames that were localized in it alone; :func:`measure_map` makes it.
 
     Args:
         path: the map's file.
-        localiser: in the map.
+        localizer: in the map.
         frames: of the test split.
         intrinsics: of each frame, (N, 3, 3).
         alone: the map's answers, accepted or not.
     """
 
     path: Path
-    localiser: MapLocaliser
+    localizer: MapLocalizer
     frames: Frames
     intrinsics: Floats
     alone: Answers
 
     def beside(self, network: PoseErrorTable, uncertainty: Callable[[], Uncertainty | None]) -> Answers:
-        """Localise each frame around a network's pose, which is the answer where the map's is not likelier to be right.
+        """Localize each frame around a network's pose, which is the answer where the map's is not likelier to be right.
 
         Args:
             network: its answers about the same frames.
@@ -94,9 +94,9 @@ class MeasuredMap:
                 map does not accept every pose.
         """
         poses = (network.predicted_position_m.cpu().numpy(), network.predicted_quaternion.cpu().numpy())
-        said = [Localisation(position_m, quaternion, 0.0) for position_m, quaternion in zip(*poses, strict=True)]
+        said = [Localization(position_m, quaternion, 0.0) for position_m, quaternion in zip(*poses, strict=True)]
         priors = [CameraPose.from_quaternion(each.quaternion, each.position_m) for each in said]
-        found, cpu_s = localise_frames(self.localiser, self.frames.image_paths, self.intrinsics, priors)
+        found, cpu_s = localize_frames(self.localizer, self.frames.image_paths, self.intrinsics, priors)
         if not all(each.is_accepted for each in found) and (stated := uncertainty()) is not None:
             said = [
                 replace(each, position_radius_m=radius_m, rotation_radius_deg=radius_deg, unfamiliarity=unfamiliarity)
@@ -107,7 +107,7 @@ class MeasuredMap:
 
     def describe(self) -> dict[str, Any]:
         """Which map it is, and how it answered."""
-        of = self.localiser.map
+        of = self.localizer.map
         return {
             "metrics": self.alone.summary(),
             "points": len(of),
@@ -116,12 +116,12 @@ class MeasuredMap:
             "mib": self.path.stat().st_size / 2**20,
             "sha256": sha256(self.path),
             "digests": of.digests,
-            "ransac_seed": self.localiser.seed,
+            "ransac_seed": self.localizer.seed,
         }
 
 
 def measure_map(path: Path, data: PoseDataModule) -> MeasuredMap:
-    """Localise every test frame in a map.
+    """Localize every test frame in a map.
 
     Args:
         path: the map's file.
@@ -131,14 +131,14 @@ def measure_map(path: Path, data: PoseDataModule) -> MeasuredMap:
         InputError: for a map that cannot be read, frames that are missing or bad, or whose cameras are unknown.
     """
     data.setup("test")
-    frames, localiser = data.frames("test"), MapLocaliser(SparseMap.load(path))
+    frames, localizer = data.frames("test"), MapLocalizer(SparseMap.load(path))
     intrinsics = frame_intrinsics(data.hparams["dataset"], data.folder, frames)
-    found, cpu_s = localise_frames(localiser, frames.image_paths, intrinsics)
-    return MeasuredMap(path, localiser, frames, intrinsics, Answers.of(found, frames, cpu_s))
+    found, cpu_s = localize_frames(localizer, frames.image_paths, intrinsics)
+    return MeasuredMap(path, localizer, frames, intrinsics, Answers.of(found, frames, cpu_s))
 
 
 def measure_map_of_run(run: Path, data: PoseDataModule) -> MeasuredMap | None:
-    """Localise every test frame in a run's map; None without one, or, with a warning, where it cannot be used.
+    """Localize every test frame in a run's map; None without one, or, with a warning, where it cannot be used.
 
     Raises:
         InputError: for frames that are missing or bad.
@@ -154,7 +154,7 @@ def measure_map_of_run(run: Path, data: PoseDataModule) -> MeasuredMap | None:
         return None
 
 
-def _table(answers: Sequence[MapLocalisation | Localisation], frames: Frames) -> PoseErrorTable:
+def _table(answers: Sequence[MapLocalization | Localization], frames: Frames) -> PoseErrorTable:
     """Poses and their errors, which are infinite where there is no pose."""
     poses = (np.array([each.position_m for each in answers]), np.array([each.quaternion for each in answers]))
     tensors = (torch.from_numpy(each.astype(np.float64)) for each in (*poses, frames.position_m, frames.quaternion))

@@ -30,7 +30,7 @@ from mambaloc.images import Image, read_image
 from mambaloc.models import LitPoseRegressor
 from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, replay, verify_bundle
 from mambaloc.runtime.contract import METADATA_KEY, MODEL_FILES, Contract
-from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import MAP_FILE, MapLocalizer, SparseMap
 from mambaloc.uncertainty import UncertaintyHead, fit_uncertainty
 
 FORMATS = tuple(MODEL_FILES)
@@ -118,11 +118,11 @@ def write_bundle(
     return WrittenBundle(deviations, int8, unsure)
 
 
-def _copy_map(path: Path, data: PoseDataModule, folder: Path) -> MapLocaliser:
+def _copy_map(path: Path, data: PoseDataModule, folder: Path) -> MapLocalizer:
     sparse_map = SparseMap.load(path)
     check_scene(path, sparse_map, data)
     shutil.copyfile(path, folder / MAP_FILE)
-    return MapLocaliser(sparse_map)
+    return MapLocalizer(sparse_map)
 
 
 def _write_models(
@@ -165,7 +165,7 @@ def _write_frames(
     data: PoseDataModule | MultiSceneDataModule,
     folder: Path,
     contract: Contract,
-    in_map: MapLocaliser | None,
+    in_map: MapLocalizer | None,
 ) -> list[dict[str, Any]]:
     """Write test frames, evenly spread, with the poses that the system itself finds, and those that its map finds.
 

@@ -12,7 +12,7 @@ from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.data.frames import Frames
 from mambaloc.errors import InputError
 from mambaloc.images import Image, read_image
-from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import MAP_FILE, MapLocalizer, SparseMap
 from mambaloc.runtime.maps.acceptance import CALIBRATION, LEAST_PROBABILITY, MOST_DEVIATION, RULE
 from mambaloc.runtime.maps.radii import LEVEL
 from mambaloc.runtime.maps.viewpoints import spread_m
@@ -28,7 +28,7 @@ _COVARIANCE = (
 
 
 def check_scene(path: Path, sparse_map: SparseMap, data: PoseDataModule) -> None:
-    """Refuse a map that does not localise training frames where their poses are: it is of another scene or camera.
+    """Refuse a map that does not localize training frames where their poses are: it is of another scene or camera.
 
     Args:
         path: of the map, for messages.
@@ -36,23 +36,23 @@ def check_scene(path: Path, sparse_map: SparseMap, data: PoseDataModule) -> None
         data: of the scene. Nothing is checked where it has no training split.
 
     Raises:
-        InputError: where hardly any frame is localised, or most elsewhere; or the scene's cameras are unknown.
+        InputError: where hardly any frame is localized, or most elsewhere; or the scene's cameras are unknown.
     """
     try:
         listed = data.listed_training_frames()
     except InputError:  # a test split alone can be exported too
         return
     frames = listed.select(np.array(listed.evenly_spread(_CHECKED)))
-    localiser, found = MapLocaliser(sparse_map), 0
+    localizer, found = MapLocalizer(sparse_map), 0
     most_m = _ELSEWHERE[0] * spread_m(sparse_map.key_poses)
     for row, intrinsics in enumerate(scene_intrinsics(data, frames)):
-        pose = localiser.localise(read_image(frames.image_paths[row]), intrinsics)
+        pose = localizer.localize(read_image(frames.image_paths[row]), intrinsics)
         near = np.linalg.norm(pose.position_m - frames.position_m[row]) <= most_m
         turned_deg = rotation_error_deg(pose.quaternion, frames.quaternion[row])
         found += bool(pose.is_accepted and near and turned_deg <= _ELSEWHERE[1])
     if 2 * found < len(frames):
         raise InputError(
-            f"{path}: is a map of {sparse_map.scene!r}, which localises {found} of {len(frames)} training frames of "
+            f"{path}: is a map of {sparse_map.scene!r}, which localizes {found} of {len(frames)} training frames of "
             f"{data.hparams['scene']}. Give the map of this scene and camera, or leave it out with --no-map."
         )
 
@@ -85,9 +85,9 @@ def describe_map(sparse_map: SparseMap) -> dict[str, Any]:
     }
 
 
-def map_vector(localiser: MapLocaliser, image: Image, intrinsics: np.ndarray) -> dict[str, Any] | None:
+def map_vector(localizer: MapLocalizer, image: Image, intrinsics: np.ndarray) -> dict[str, Any] | None:
     """The pose that the map finds of a frame; None where that is not accepted."""
-    pose = localiser.localise(image, intrinsics)
+    pose = localizer.localize(image, intrinsics)
     found = {
         "position_m": pose.position_m.tolist(),
         "quaternion_wxyz": pose.quaternion.tolist(),

@@ -78,7 +78,7 @@ class DeployedNetwork(nn.Module):
         self.network, self.uncertainty = network, uncertainty
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Localise images."""
+        """Localize images."""
         feats = self.network.forward_backbone(image)
         prediction = self.network.forward_head(self.network.features(feats), intrinsics)
         outputs: tuple[Tensor, ...] = (prediction.position_m, canonical(prediction.quaternion))

@@ -16,13 +16,13 @@ TARGETS = ("android", "ios", "react_native", "web", "pc")
 """Kinds of app that there is a page on integration for."""
 
 _INTEGRATION = files("mambaloc.export") / "integration"
-_MAP_LOCALISER = "map_localiser.hpp"
+_MAP_LOCALIZER = "map_localiser.hpp"
 
 
 def write_pages(
     folder: Path, contract: Contract, dataset: str, models: Sequence[str], target: str, sparse_map: SparseMap | None
 ) -> None:
-    """Write ``README.md``, ``LICENSE.txt`` and ``INTEGRATION.md``; beside a map, its localiser in C++ for native apps.
+    """Write ``README.md``, ``LICENSE.txt`` and ``INTEGRATION.md``; beside a map, its localizer in C++ for native apps.
 
     Args:
         folder: the bundle.
@@ -41,7 +41,7 @@ def write_pages(
     ):
         (folder / name).write_text(text, encoding="utf-8")
     if sparse_map is not None and is_native:
-        (folder / _MAP_LOCALISER).write_bytes((_INTEGRATION / _MAP_LOCALISER).read_bytes())
+        (folder / _MAP_LOCALIZER).write_bytes((_INTEGRATION / _MAP_LOCALIZER).read_bytes())
 
 
 def _licence(dataset: str) -> str:
@@ -57,7 +57,7 @@ def _card(contract: Contract, models: Sequence[str], sparse_map: SparseMap | Non
     if sparse_map is not None:
         points, frames = len(sparse_map), len(sparse_map.key_poses)
         files.append(f"- `{MAP_FILE}`: sparse map, {points} points of {frames} key frames, for poses to centimetres")
-        files += [f"- `{_MAP_LOCALISER}`: localises in it, in C++"] if is_native else []
+        files += [f"- `{_MAP_LOCALIZER}`: localizes in it, in C++"] if is_native else []
     listed = "\n".join(files)
     trained = "\n".join(
         f"- {name}: {_in_words(value)}" for name, value in contract.trained.items() if value is not None
@@ -92,7 +92,7 @@ def _world(contract: Contract) -> str:
 
 The models, the map, `frames/` and `trajectory.json` are in the scene's own frame, so that float32 holds positions.
 Add `world.offset_m` in `contract.json`, {list(contract.world.offset_m)}, to a position **in double precision** for the
-world of the data that the scene was made of. `mambaloc.runtime.Localiser`, the trajectories of `mambaloc localize` and
+world of the data that the scene was made of. `mambaloc.runtime.Localizer`, the trajectories of `mambaloc localize` and
 the page in the browser do so already.
 
 """
@@ -103,7 +103,7 @@ def _lens(contract: Contract) -> str:
         return ""
     return """## Another lens
 
-Pictures of any camera and shape are localised if their intrinsics are known. The models take them as a required input,
+Pictures of any camera and shape are localized if their intrinsics are known. The models take them as a required input,
 which `INTEGRATION.md` fills in with the training camera's, `intrinsics` in `contract.json`, where they are not.
 
 """
@@ -119,14 +119,14 @@ def _pictures(undistortion: Undistortion) -> str:
 {must} The lens of their camera is not known here:
 {undistortion.unknown}.
 """
-    (width, height), (fx, fy), (cx, cy) = undistortion.stored, left.focal_px, left.centre_px
+    (width, height), (fx, fy), (cx, cy) = undistortion.stored, left.focal_px, left.center_px
     return f"""## Pictures
 
 {must} Their camera stored these
 as {width}x{height}, through a lens of OpenCV's {lens.name} model: `lens` of `undistortion` in `contract.json`.
 Undistorting leaves {left.width}x{left.height} with the pinhole matrix
 {fx:.2f} 0 {cx:.2f}, 0 {fy:.2f} {cy:.2f}, 0 0 1, which is `leaves` there. Pictures of the same camera need the same,
-resized ones with both scaled: in Python, `Localiser.localise(picture, is_distorted=True)` and
+resized ones with both scaled: in Python, `Localizer.localize(picture, is_distorted=True)` and
 `mambaloc localize --distorted`; in an app, OpenCV's `initUndistortRectifyMap` (for a fisheye,
 `fisheye::initUndistortRectifyMap`) and `remap`, as `function` there says.
 """

@@ -18,7 +18,7 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 from torch import Tensor
 
 from mambaloc.data import PoseDataModule
-from mambaloc.metrics import error_table, summarise
+from mambaloc.metrics import error_table, summarize
 from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT
 from mambaloc.types import PoseBatch, PosePrediction
 
@@ -77,12 +77,12 @@ def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> EightBit:
     before = median_errors(model, data)
     batches, count = _calibration_batches(data), len(data.frames("test"))
     for kind, kept in (("all layers", []), ("mixed", sensitive_nodes(prepared.graph))):
-        quantised = _quantised(prepared, batches, kept)
-        after = median_errors(quantised, data)
+        quantized = _quantized(prepared, batches, kept)
+        after = median_errors(quantized, data)
         position_m, rotation_deg = (after[name] for name in ("position_error_m", "rotation_error_deg"))
         ratios = [after[name] / max(before[name], 1e-9) for name in ("position_error_m", "rotation_error_deg")]
         loss = float(np.max(ratios)) - 1  # NaN stays NaN
-        found = EightBit(quantised, kind, position_m, rotation_deg, loss, count)
+        found = EightBit(quantized, kind, position_m, rotation_deg, loss, count)
         if found.fits:
             break
     return found
@@ -96,12 +96,12 @@ def median_errors(model: onnx.ModelProto, data: PoseDataModule) -> dict[str, flo
 
     names = [tensor.name for tensor in session.get_inputs()]
 
-    def localise(image: Tensor, intrinsics: Tensor | None) -> PosePrediction:
+    def localize(image: Tensor, intrinsics: Tensor | None) -> PosePrediction:
         given = {IMAGE_INPUT: image.numpy(), INTRINSICS_INPUT: None if intrinsics is None else intrinsics.numpy()}
         position_m, quaternion, *_ = session.run(None, {name: given[name] for name in names})
         return PosePrediction(torch.from_numpy(position_m), torch.from_numpy(quaternion))
 
-    return summarise(error_table(localise, data.batches("test")))
+    return summarize(error_table(localize, data.batches("test")))
 
 
 def sensitive_nodes(graph: onnx.GraphProto) -> list[str]:
@@ -132,7 +132,7 @@ def _calibration_batches(data: PoseDataModule) -> list[PoseBatch]:
     return list(data.batches("train", rows, size=1))
 
 
-def _quantised(model: onnx.ModelProto, batches: Sequence[PoseBatch], kept: Sequence[str]) -> onnx.ModelProto:
+def _quantized(model: onnx.ModelProto, batches: Sequence[PoseBatch], kept: Sequence[str]) -> onnx.ModelProto:
     """Static QDQ: unsigned activations, signed weights with a scale for each channel.
 
     All eight bits of a weight: in seven, which ONNX Runtime advises for x86 processors without VNNI, MobileNetV2's

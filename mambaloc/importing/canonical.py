@@ -156,11 +156,11 @@ def _adjusted(camera: str) -> str:
 
 
 def _described(camera: Camera, lens: Camera) -> dict[str, Any]:
-    told = numbers_to_json(camera.size, camera.focal_px, camera.centre_px)
+    told = numbers_to_json(camera.size, camera.focal_px, camera.center_px)
     if lens.distorted is None:
         images = "as they were" if lens.size == camera.size else f"the middle of {lens.width}x{lens.height}"
         return {**told, "images": f"{images}: the camera is a pinhole", "model": lens.model}
-    was = {"model": lens.model, **numbers_to_json(lens.size, lens.focal_px, lens.centre_px)}
+    was = {"model": lens.model, **numbers_to_json(lens.size, lens.focal_px, lens.center_px)}
     if isinstance(lens.distorted, CameraModel):
         was |= model_to_json(lens.distorted, lens.size)
     else:

@@ -24,8 +24,8 @@ from mambaloc.images import Image, read_image
 from mambaloc.mapping.building import PosedFrames, build_map, describe_points
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
-from mambaloc.metrics import summarise_errors
-from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalisation, MapLocaliser, SparseMap
+from mambaloc.metrics import summarize_errors
+from mambaloc.runtime.maps import MAP_FILE, CameraPose, MapLocalization, MapLocalizer, SparseMap
 from mambaloc.runtime.maps.radii import LEVEL
 from mambaloc.runtime.rotations import (
     matrix_from_quaternion,
@@ -41,7 +41,7 @@ _WRONG = (0.2, 5.0)  # metres and degrees
 
 @dataclass(frozen=True)
 class MapErrors:
-    """How a map localised frames, a row a frame and RANSAC seed.
+    """How a map localized frames, a row a frame and RANSAC seed.
 
     Shape:
         all (N,): errors are infinite where there was no pose.
@@ -68,7 +68,7 @@ class MapErrors:
         """
         is_wrong = (self.position_m > _WRONG[0]) | (self.rotation_deg > _WRONG[1])
         return {
-            **summarise_errors(self.position_m, self.rotation_deg),
+            **summarize_errors(self.position_m, self.rotation_deg),
             "without_pose": float(np.isinf(self.position_m).mean()),
             "above_20cm": float((self.position_m > _WRONG[0]).mean()),
             "accepted": float(self.is_accepted.mean()),
@@ -86,16 +86,16 @@ class MapErrors:
         )
 
 
-def localise_frames(
-    localiser: MapLocaliser,
+def localize_frames(
+    localizer: MapLocalizer,
     images: Sequence[Path | Image],
     intrinsics: Floats,
     priors: Sequence[CameraPose | None] | None = None,
-) -> tuple[list[MapLocalisation], Floats]:
-    """Localise pictures one after another.
+) -> tuple[list[MapLocalization], Floats]:
+    """Localize pictures one after another.
 
     Args:
-        localiser: in the map.
+        localizer: in the map.
         images: paths or RGB arrays (H, W, 3), N of them.
         intrinsics: (N, 3, 3).
         priors: a pose to search around, of each picture that has one.
@@ -112,7 +112,7 @@ def localise_frames(
         for image, matrix, prior in progress(rows, "queries", len(images)):
             rgb = read_image(image) if isinstance(image, Path) else image
             start = time.process_time()
-            found.append(localiser.localise(rgb, matrix, prior))
+            found.append(localizer.localize(rgb, matrix, prior))
             cpu_s.append(time.process_time() - start)
     return found, np.array(cpu_s)
 
@@ -129,10 +129,10 @@ def _on_one_core() -> Iterator[None]:
 
 
 def measure(sparse_map: SparseMap, frames: PosedFrames, seeds: Sequence[int]) -> MapErrors:
-    """Localise frames in a map, once with each RANSAC seed."""
+    """Localize frames in a map, once with each RANSAC seed."""
     rows = []
     for seed in seeds:
-        answers, cpu_s = localise_frames(MapLocaliser(sparse_map, seed), frames.images, frames.intrinsics)
+        answers, cpu_s = localize_frames(MapLocalizer(sparse_map, seed), frames.images, frames.intrinsics)
         for found, taken_s, truth in zip(answers, cpu_s, frames.world_from_cam, strict=True):
             off_m = np.linalg.norm(found.position_m - truth[:3, 3])
             off_deg = rotation_error_deg(found.quaternion, quaternion_from_matrix(truth[:3, :3]))
@@ -177,7 +177,7 @@ class MeasuredMap:
     Args:
         sparse_map: the map.
         test: frames.
-        errors: how it localised them.
+        errors: how it localized them.
         result: what ``metrics.json`` says, with infinity where that has null.
     """
 

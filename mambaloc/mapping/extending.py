@@ -15,7 +15,7 @@ from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.structure import DRIFT, DRIFT_RAD, mean_descriptors, triangulated, views_of
 from mambaloc.mapping.tracks import agreeing
 from mambaloc.mapping.triangulation import Observations
-from mambaloc.runtime.maps import CameraPose, MapLocaliser
+from mambaloc.runtime.maps import CameraPose, MapLocalizer
 from mambaloc.runtime.maps.features import Features
 from mambaloc.runtime.maps.viewpoints import spread_m
 
@@ -47,7 +47,7 @@ class Extension:
 
 
 def extend(
-    localiser: MapLocaliser,
+    localizer: MapLocalizer,
     features: Sequence[Features],
     matched: Callable[[int, int], Indices],
     world_from_cam: Floats,
@@ -57,19 +57,19 @@ def extend(
     """Adjust the poses of new key frames to the map's points, which stay, and to points that they see together.
 
     Args:
-        localiser: in the map.
+        localizer: in the map.
         features: of each new key frame.
         matched: rows of keypoints that match between two of them, (M, 2).
         world_from_cam: where the map found it, (N, 4, 4).
         given: the same from elsewhere, a prior; None where that is not known.
         most_points: new points to keep.
     """
-    sparse_map, rng, poses = localiser.map, np.random.default_rng(0), world_from_cam
+    sparse_map, rng, poses = localizer.map, np.random.default_rng(0), world_from_cam
     unit_m = spread_m(sparse_map.key_poses)
     drift = (_FREE * unit_m, _FREE) if given is None else (DRIFT * unit_m, DRIFT_RAD)
     unit_px, focal_px = sparse_map.size[0] / 160, sparse_map.intrinsics[0, 0]
     for near_px in _NEAR_PX:
-        known, is_known = _known(localiser, features, poses, near_px * unit_px / focal_px)
+        known, is_known = _known(localizer, features, poses, near_px * unit_px / focal_px)
         pairs, matches = _pairs(features, matched, is_known, poses, near_px * unit_px)
         points_m, seen, keypoint, _ = triangulated(features, poses, pairs, matches, near_px * unit_px, rng)
         if near_px != _NEAR_PX[-1] and len(poses) > 1:
@@ -86,12 +86,12 @@ def extend(
 
 
 def _known(
-    localiser: MapLocaliser, features: Sequence[Features], world_from_cam: Floats, near: float
+    localizer: MapLocalizer, features: Sequence[Features], world_from_cam: Floats, near: float
 ) -> tuple[Observations, list[NDArray[np.bool_]]]:
     """What frames see of the map, whose points are the tracks, and which of their keypoints these are."""
     found, is_known = [], [np.zeros(len(each), bool) for each in features]
     for row, (each, pose) in enumerate(zip(features, world_from_cam, strict=True)):
-        keypoints, points = localiser.matches(each, CameraPose(pose[:3, :3], pose[:3, 3]))
+        keypoints, points = localizer.matches(each, CameraPose(pose[:3, :3], pose[:3, 3]))
         found.append((np.full(len(points), row), points, each.rays[keypoints]))
         is_known[row][keypoints] = True
     frame, track, rays = (np.concatenate(each) for each in zip(*found, strict=True))

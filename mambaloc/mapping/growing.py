@@ -16,7 +16,7 @@ from mambaloc.mapping.choosing import bytes_each
 from mambaloc.mapping.extending import extend
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.tracks import match
-from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import CameraPose, MapLocalizer, SparseMap
 from mambaloc.runtime.maps.drift import drift_moves, drift_weights, known_moves
 from mambaloc.runtime.maps.features import Features, quantized
 from mambaloc.runtime.maps.viewpoints import spread_m
@@ -36,7 +36,7 @@ class NewFrame:
 
     Args:
         name: of its file, or its number in a film.
-        features: its keypoints, as :meth:`~mambaloc.runtime.maps.MapLocaliser.features` finds them.
+        features: its keypoints, as :meth:`~mambaloc.runtime.maps.MapLocalizer.features` finds them.
         given: its pose in the map's world, where it is known.
     """
 
@@ -52,8 +52,8 @@ class Growth:
     Args:
         sparse_map: the map; its first points and key frames are those of the map before, bit for bit.
         key_frames: names of those that became key frames.
-        lost: names of the frames that were not localised, or whose given pose says otherwise.
-        rounds: how often the frames were localised, each time in the map that those before had made.
+        lost: names of the frames that were not localized, or whose given pose says otherwise.
+        rounds: how often the frames were localized, each time in the map that those before had made.
     """
 
     sparse_map: SparseMap
@@ -76,7 +76,7 @@ class Growth:
 def add_frames(
     sparse_map: SparseMap, frames: Sequence[NewFrame], session: str, most: int, most_bytes: int = 4 * 2**20
 ) -> Growth:
-    """Localise frames in a map, make key frames of those found, and triangulate what these add.
+    """Localize frames in a map, make key frames of those found, and triangulate what these add.
 
     A frame may be found only once its neighbours were added, so that is repeated until nothing more is found. Keypoints
     that show no point of the map are matched between the new key frames, whose poses are adjusted to all that they see.
@@ -147,15 +147,15 @@ def remove_session(sparse_map: SparseMap, session: str) -> SparseMap:
 
 def _found(sparse_map: SparseMap, frames: Sequence[NewFrame], rows: list[int]) -> tuple[dict[int, CameraPose], int]:
     """Poses of the frames that the map finds, in its own frame, and how many contradict those given."""
-    localiser, unit_m = MapLocaliser(sparse_map), spread_m(sparse_map.key_poses)
+    localizer, unit_m = MapLocalizer(sparse_map), spread_m(sparse_map.key_poses)
     found, contradict = {}, 0
     for row in rows:
         given = frames[row].given
-        located = localiser.localise_features(frames[row].features, given)
+        located = localizer.localize_features(frames[row].features, given)
         if located.is_accepted and located.inliers >= _INLIERS * sparse_map.least_inliers:
             pose = CameraPose.from_quaternion(located.quaternion, located.position_m)
             if given is None or _agree(pose, given, unit_m):
-                found[row] = localiser.drift.to_adjusted(pose)
+                found[row] = localizer.drift.to_adjusted(pose)
             else:
                 contradict += 1
     return found, contradict
@@ -173,15 +173,15 @@ def _grown(
     """The map with frames whose poses are known, and which became key frames; their poses are adjusted in place."""
     rows = np.array(sorted(poses))
     key = rows[farthest_first(np.stack([poses[row].matrix for row in rows]), most)].tolist()
-    localiser = MapLocaliser(sparse_map)
+    localizer = MapLocalizer(sparse_map)
     given = [pose for row in key if (pose := frames[row].given) is not None]
     is_given = len(given) == len(key)
     new = extend(
-        localiser,
+        localizer,
         [frames[row].features for row in key],
         lambda first, second: matched(key[first], key[second]),
         np.stack([poses[row].matrix for row in key]),
-        np.stack([localiser.drift.to_adjusted(pose).matrix for pose in given]) if is_given else None,
+        np.stack([localizer.drift.to_adjusted(pose).matrix for pose in given]) if is_given else None,
         most_bytes // bytes_each(len(sparse_map.key_poses) + len(key)),
     )
     for row, pose in zip(key, new.world_from_cam, strict=True):

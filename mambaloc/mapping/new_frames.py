@@ -17,7 +17,7 @@ from mambaloc.images import read_image
 from mambaloc.mapping.growing import NewFrame
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import recipe_of
-from mambaloc.runtime.maps import CameraPose, MapLocaliser
+from mambaloc.runtime.maps import CameraPose, MapLocalizer
 from mambaloc.runtime.sources import frames_of
 
 _MOST_FRAMES = 400  # of a film; two a second of three minutes
@@ -28,7 +28,7 @@ _CLEARLY_MORE = 1.3
 
 def read_new_frames(
     source: Path,
-    localiser: MapLocaliser,
+    localizer: MapLocalizer,
     intrinsics: NDArray[np.float64] | None = None,
     is_distorted: bool = False,
 ) -> list[NewFrame]:
@@ -37,7 +37,7 @@ def read_new_frames(
     Args:
         source: an imported scene's folder or a recipe, whose training frames have poses and cameras; a folder of
             pictures, or a film, of which up to 400 frames are read.
-        localiser: in the map that they are for.
+        localizer: in the map that they are for.
         intrinsics: (3, 3) of the pictures; the map's camera unless given.
         is_distorted: pictures are as the map's camera stores them, and are undistorted by its lens.
 
@@ -51,25 +51,25 @@ def read_new_frames(
             raise InputError(f"{source}: has intrinsics of its own. Leave out --intrinsics.")
         if is_distorted:
             raise InputError(f"{source}: a scene's pictures have no distortion. Leave out --distorted.")
-        return list(_posed(source, localiser))
-    frames = list(_unposed(source, localiser, intrinsics, is_distorted))
+        return list(_posed(source, localizer))
+    frames = list(_unposed(source, localizer, intrinsics, is_distorted))
     if intrinsics is None:
         remedy = "Give them without distortion, and their camera" if is_distorted else "Give their camera"
-        _check_focal_length(source, localiser, frames, remedy)
+        _check_focal_length(source, localizer, frames, remedy)
     return frames
 
 
-def _posed(source: Path, localiser: MapLocaliser) -> Iterator[NewFrame]:
+def _posed(source: Path, localizer: MapLocalizer) -> Iterator[NewFrame]:
     frames = read_frames(recipe_of(source), "train")
     for image, intrinsics, pose in progress(
         zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True), "keypoints", len(frames)
     ):
-        features = localiser.features(read_image(image) if isinstance(image, Path) else image, intrinsics)
+        features = localizer.features(read_image(image) if isinstance(image, Path) else image, intrinsics)
         yield NewFrame(Path(str(image)).name, features, CameraPose(pose[:3, :3], pose[:3, 3]))
 
 
 def _unposed(
-    source: Path, localiser: MapLocaliser, intrinsics: NDArray[np.float64] | None, is_distorted: bool
+    source: Path, localizer: MapLocalizer, intrinsics: NDArray[np.float64] | None, is_distorted: bool
 ) -> Iterator[NewFrame]:
     frames, count = frames_of(source)
     if count is None:  # some films do not say; they are decoded twice
@@ -80,11 +80,11 @@ def _unposed(
     for frame in progress(chosen, "keypoints", -(-count // step)):
         image, matrix = frame.image, intrinsics
         if is_distorted:
-            image, matrix = localiser.map.undistortion.apply(image, str(source))
-        yield NewFrame(frame.name, localiser.features(image, matrix))
+            image, matrix = localizer.map.undistortion.apply(image, str(source))
+        yield NewFrame(frame.name, localizer.features(image, matrix))
 
 
-def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[NewFrame], remedy: str) -> None:
+def _check_focal_length(source: Path, localizer: MapLocalizer, frames: Sequence[NewFrame], remedy: str) -> None:
     """Refuse pictures of another camera of the same shape, which would bend what they add."""
     some = [frames[row] for row in np.unique(np.linspace(0, len(frames) - 1, _FOCAL_FRAMES).round().astype(int))]
     inliers = {}
@@ -92,7 +92,7 @@ def _check_focal_length(source: Path, localiser: MapLocaliser, frames: Sequence[
         zoom = np.diag((scale, scale, 1))
         zoom[:2, 2] = (1 - scale) * some[0].features.intrinsics[:2, 2]
         zoomed = [replace(frame.features, intrinsics=zoom @ frame.features.intrinsics) for frame in some]
-        found = [localiser.localise_features(features) for features in zoomed]
+        found = [localizer.localize_features(features) for features in zoomed]
         inliers[scale] = sum(each.inliers for each in found if each.is_accepted)
     best = max(inliers, key=lambda scale: inliers[scale])
     if inliers[best] > _CLEARLY_MORE * inliers[1.0]:

@@ -20,7 +20,7 @@ class MapRecipe:
         root: as :class:`~mambaloc.data.PoseDataModule` takes it.
         label: name of the map in results; the scene's name unless given.
         settings: how the map is built.
-        ransac_seeds: each test frame is localised once with each.
+        ransac_seeds: each test frame is localized once with each.
     """
 
     scene: str

@@ -93,14 +93,14 @@ def residuals(cam_from_world: Floats, seen: Observations, points: Floats) -> Flo
 
 def _best_of_pairs(cam_from_world: Floats, seen: Observations, rng: np.random.Generator) -> Floats:
     """Of drawn pairs of views of each track, the point of the pair with the least truncated squares of all views."""
-    centre, ray = _world_rays(cam_from_world, seen)
+    center, ray = _world_rays(cam_from_world, seen)
     start = np.flatnonzero(np.diff(seen.track, prepend=-1))
     length = np.diff(start, append=len(seen))
     best, least = np.zeros((len(start), 3)), np.full(len(start), np.inf)
     for _ in range(_DRAWS):
         one = rng.integers(length)
         other = (one + 1 + rng.integers(length - 1)) % length
-        points = _between(centre[start + one], ray[start + one], centre[start + other], ray[start + other])
+        points = _between(center[start + one], ray[start + one], center[start + other], ray[start + other])
         off = np.minimum(residuals(cam_from_world, seen, points) / seen.near, 1) ** 2
         cost = np.add.reduceat(off, start)
         is_better = cost < least
@@ -158,8 +158,8 @@ def _widest_angle_deg(cam_from_world: Floats, seen: Observations, points: Floats
     That is between half of the widest and the widest itself.
     """
     used = seen.select(counts)
-    centre = _world_rays(cam_from_world, used)[0]
-    towards = centre - points[used.track]
+    center = _world_rays(cam_from_world, used)[0]
+    towards = center - points[used.track]
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     tracks, start = np.unique(used.track, return_index=True)
     pivot, least = np.zeros((len(points), 3)), np.ones(len(points))

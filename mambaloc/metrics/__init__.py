@@ -5,8 +5,11 @@ from mambaloc.metrics.pose_errors import (
     PoseErrors,
     PoseErrorTable,
     error_table,
-    summarise,
-    summarise_errors,
+    summarize,
+    summarize_errors,
 )
+from mambaloc.renamed import renamed
 
-__all__ = ["RECALL_THRESHOLDS", "PoseErrorTable", "PoseErrors", "error_table", "summarise", "summarise_errors"]
+__all__ = ["RECALL_THRESHOLDS", "PoseErrorTable", "PoseErrors", "error_table", "summarize", "summarize_errors"]
+
+__getattr__ = renamed(__name__, {"summarise": "summarize", "summarise_errors": "summarize_errors"})

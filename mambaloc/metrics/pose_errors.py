@@ -77,7 +77,7 @@ class PoseErrors(Metric):
     predicted_quaternion: list[Tensor]
     true_position_m: list[Tensor]
     true_quaternion: list[Tensor]
-    is_recognised: list[Tensor]
+    is_recognized: list[Tensor]
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,7 +87,7 @@ class PoseErrors(Metric):
             "predicted_quaternion",
             "true_position_m",
             "true_quaternion",
-            "is_recognised",
+            "is_recognized",
         ):
             self.add_state(state, default=[], dist_reduce_fx="cat")
 
@@ -98,14 +98,14 @@ class PoseErrors(Metric):
         self.predicted_quaternion.append(prediction.quaternion.detach().float())
         self.true_position_m.append(target.position_m)
         self.true_quaternion.append(target.quaternion)
-        is_recognised = torch.ones_like(target.index, dtype=torch.bool)
+        is_recognized = torch.ones_like(target.index, dtype=torch.bool)
         if prediction.scene_logits is not None and target.scene is not None:
-            is_recognised = prediction.scene_logits.argmax(dim=-1) == target.scene
-        self.is_recognised.append(is_recognised)
+            is_recognized = prediction.scene_logits.argmax(dim=-1) == target.scene
+        self.is_recognized.append(is_recognized)
 
     def compute(self) -> dict[str, float]:
         """Reduce the whole split; see :func:`summarise`."""
-        return summarise(self._table())
+        return summarize(self._table())
 
     def table(self) -> PoseErrorTable:
         """Return every frame's prediction and errors; every process must call it."""
@@ -119,37 +119,37 @@ class PoseErrors(Metric):
         first = first.scatter_reduce(0, order, torch.arange(len(index), device=index.device), "amin")
         poses = (self.predicted_position_m, self.predicted_quaternion, self.true_position_m, self.true_quaternion)
         table = PoseErrorTable.of(index[first], *(dim_zero_cat(state)[first] for state in poses))
-        is_recognised = dim_zero_cat(self.is_recognised)[first]
+        is_recognized = dim_zero_cat(self.is_recognized)[first]
         position_m, rotation_deg = (
-            torch.where(is_recognised, errors, torch.inf)
+            torch.where(is_recognized, errors, torch.inf)
             for errors in (table.position_error_m, table.rotation_error_deg)
         )
         return replace(table, position_error_m=position_m, rotation_error_deg=rotation_deg)
 
 
 def error_table(
-    localise: Callable[[Tensor, Tensor | None], PosePrediction], batches: Iterable[PoseBatch]
+    localize: Callable[[Tensor, Tensor | None], PosePrediction], batches: Iterable[PoseBatch]
 ) -> PoseErrorTable:
-    """Localise frames, and return every frame's prediction and errors.
+    """Localize frames, and return every frame's prediction and errors.
 
     Only this process's frames count: one process of a distributed training may call it alone.
 
     Args:
-        localise: images, (B, 3, H, W) in 0..1, and their intrinsics, (B, 3, 3) in pixels, to poses.
+        localize: images, (B, 3, H, W) in 0..1, and their intrinsics, (B, 3, 3) in pixels, to poses.
         batches: of a split, cropped.
     """
     errors = PoseErrors()
     for batch in batches:
-        errors.update(localise(batch.image, batch.intrinsics), batch)
+        errors.update(localize(batch.image, batch.intrinsics), batch)
     return errors._table()  # table() would wait for the other processes
 
 
-def summarise(table: PoseErrorTable) -> dict[str, float]:
+def summarize(table: PoseErrorTable) -> dict[str, float]:
     """Reduce per-frame errors; see :func:`summarise_errors`."""
-    return summarise_errors(table.position_error_m.cpu().numpy(), table.rotation_error_deg.cpu().numpy())
+    return summarize_errors(table.position_error_m.cpu().numpy(), table.rotation_error_deg.cpu().numpy())
 
 
-def summarise_errors(position_m: ArrayLike, rotation_deg: ArrayLike) -> dict[str, float]:
+def summarize_errors(position_m: ArrayLike, rotation_deg: ArrayLike) -> dict[str, float]:
     """Reduce errors to medians, means, the worst position and recalls; the plain names are the medians.
 
     The median of an even number of frames is the mean of the middle two. An infinite error, of a frame without a pose,

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, PoseNetwork, build_gis
+from mambaloc.nn import Discretization, GISMode, PooledBackbone, PoseHead, PoseNetwork, build_gis
 
 
 class FeatureAttention(nn.Module):
@@ -57,7 +57,7 @@ class AtLoc(PoseNetwork):
         width: int = 2048,
         dropout: float = 0.5,
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
     ) -> None:
         super().__init__()
         self.backbone = backbone

@@ -25,7 +25,7 @@ from mambaloc.models.feature_cache import FeatureCache
 from mambaloc.models.optim import Schedule, build_adam, build_step_schedule, check_span, training_steps
 from mambaloc.models.scene_tables import train_rows_only
 from mambaloc.models.weights import build_from, read_checkpoint, start_from
-from mambaloc.nn import Discretisation, GISMode, PoseNetwork, PositionScale, SplitBackbone, recompute_stages
+from mambaloc.nn import Discretization, GISMode, PoseNetwork, PositionScale, SplitBackbone, recompute_stages
 from mambaloc.types import PoseBatch, PosePrediction, height_and_width
 
 BACKBONE_ARGUMENTS = {
@@ -101,7 +101,7 @@ class LitPoseRegressor(L.LightningModule):
         pixel_mean: tuple[float, float, float] | None = None,
         pixel_std: tuple[float, float, float] | None = None,
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
         scenes: list[str] | None = None,
         warm_start: str | None = None,
         new_scenes_only: bool = False,
@@ -188,7 +188,7 @@ class LitPoseRegressor(L.LightningModule):
         return {name: value for name, value in self.hparams.items() if name in taken}
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None) -> PosePrediction:
-        """Localise images, (B, 3, H, W) in 0..1, of cameras (B, 3, 3) in pixels of them, in given scenes (B,)."""
+        """Localize images, (B, 3, H, W) in 0..1, of cameras (B, 3, 3) in pixels of them, in given scenes (B,)."""
         return self.network(image, intrinsics, scene)
 
     def setup(self, stage: str) -> None:
@@ -284,7 +284,7 @@ class LitPoseRegressor(L.LightningModule):
         self.test_errors.update(self(batch.image, batch.intrinsics), batch)
 
     def predict_step(self, batch: PoseBatch, batch_idx: int, dataloader_idx: int = 0) -> PosePrediction:
-        """Localise a batch without looking at its true poses."""
+        """Localize a batch without looking at its true poses."""
         return self(batch.image, batch.intrinsics)
 
     def on_validation_epoch_end(self) -> None:

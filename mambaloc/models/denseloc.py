@@ -19,7 +19,7 @@ from mambaloc.nn import (
     CellHead,
     CellPosition,
     CellRotation,
-    Discretisation,
+    Discretization,
     GISMode,
     PoseHead,
     PoseNetwork,
@@ -77,7 +77,7 @@ class DenseLoc(PoseNetwork):
         rotation: CellRotation = "procrustes",
         position: CellPosition = "votes",
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
         scenes: int = 1,
     ) -> None:
         super().__init__()

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, PoseNetwork, Rotation, build_gis
+from mambaloc.nn import Discretization, GISMode, PooledBackbone, PoseHead, PoseNetwork, Rotation, build_gis
 
 _ROWS, _COLUMNS = 32, 64
 
@@ -36,7 +36,7 @@ class LSTMPoseNet(PoseNetwork):
         dropout: float = 0.5,
         rotation: Rotation = "log_quaternion",
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
     ) -> None:
         super().__init__()
         self.backbone = backbone

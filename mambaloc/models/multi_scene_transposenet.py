@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Backbone, Discretisation, GISMode, PoseHead, PoseNetwork, TokenEncoder, build_gis
+from mambaloc.nn import Backbone, Discretization, GISMode, PoseHead, PoseNetwork, TokenEncoder, build_gis
 from mambaloc.types import PosePrediction
 
 
@@ -55,7 +55,7 @@ class MultiSceneTransPoseNet(PoseNetwork):
         head_hidden: int = 1024,
         dropout: float = 0.1,
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
         scenes: int = 1,
     ) -> None:
         super().__init__()

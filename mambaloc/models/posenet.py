@@ -12,7 +12,7 @@ from mambaloc.errors import InputError
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
 from mambaloc.nn import (
-    Discretisation,
+    Discretization,
     GISMode,
     ImageBackbone,
     PooledBackbone,
@@ -48,7 +48,7 @@ class PoseNet(PoseNetwork):
         dropout: float = 0.5,
         rotation: Rotation = "quaternion",
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
     ) -> None:
         super().__init__()
         self.backbone = backbone
@@ -98,11 +98,11 @@ class GoogLeNetBackbone(ImageBackbone):
 
     def forward(self, image: Tensor) -> Tensor:
         """Normalise the image and return its feature."""
-        return self.with_auxiliary(image)[0] if self.training else self.body(self.normalised(image))
+        return self.with_auxiliary(image)[0] if self.training else self.body(self.normalized(image))
 
     def with_auxiliary(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """While training: the feature, and those after stages 4d and 4a; (B, 1024) each."""
-        return self.body(self.normalised(image))
+        return self.body(self.normalized(image))
 
 
 class GoogLeNetPoseNet(PoseNet):
@@ -118,7 +118,7 @@ class GoogLeNetPoseNet(PoseNet):
         self.auxiliary_heads = nn.ModuleList(PoseHead(backbone.width) for _ in range(2))
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None) -> PosePrediction:
-        """Localise images."""
+        """Localize images."""
         if not self.training:
             return super().forward(image)
         pooled_BD, *auxiliary = self.backbone.with_auxiliary(image)

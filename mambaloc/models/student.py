@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Discretisation, GISMode, PooledBackbone, PoseHead, PoseNetwork, build_gis
+from mambaloc.nn import Discretization, GISMode, PooledBackbone, PoseHead, PoseNetwork, build_gis
 
 
 class Student(PoseNetwork):
@@ -31,7 +31,7 @@ class Student(PoseNetwork):
         width: int = 512,
         dropout: float = 0.1,
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
     ) -> None:
         super().__init__()
         self.backbone = backbone

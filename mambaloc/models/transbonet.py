@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Backbone, Discretisation, GISMode, PoseHead, PoseNetwork, build_gis
+from mambaloc.nn import Backbone, Discretization, GISMode, PoseHead, PoseNetwork, build_gis
 
 
 class TransformerBottleneck(nn.Module):
@@ -119,7 +119,7 @@ class TransBoNet(PoseNetwork):
         head_hidden: int = 1024,
         dropout: float = 0.5,
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
     ) -> None:
         super().__init__()
         self.backbone, self.image_size = backbone, image_size

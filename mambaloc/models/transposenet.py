@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mambaloc.models.base import LitPoseRegressor
 from mambaloc.models.registry import register_model
-from mambaloc.nn import Backbone, Discretisation, GISMode, PoseHead, PoseNetwork, TokenEncoder, build_gis
+from mambaloc.nn import Backbone, Discretization, GISMode, PoseHead, PoseNetwork, TokenEncoder, build_gis
 
 
 class TransPoseNet(PoseNetwork):
@@ -43,7 +43,7 @@ class TransPoseNet(PoseNetwork):
         dropout: float = 0.1,
         attention_dropout: float = 0.0,
         gis: GISMode = "none",
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
     ) -> None:
         super().__init__()
         self.backbone, self.image_size = backbone, image_size

@@ -8,7 +8,8 @@ from mambaloc.nn.gis import GISMode, GlobalInformationSelector, build_gis
 from mambaloc.nn.heads import PoseHead, PositionScale, RegressionHead, Rotation, last_layers
 from mambaloc.nn.network import PoseNetwork
 from mambaloc.nn.recomputed import recompute_stages
-from mambaloc.nn.ssm import Discretisation, MambaMixer, selective_scan
+from mambaloc.nn.ssm import Discretization, MambaMixer, selective_scan
+from mambaloc.renamed import renamed
 
 __all__ = [
     "Backbone",
@@ -16,7 +17,7 @@ __all__ = [
     "CellHead",
     "CellPosition",
     "CellRotation",
-    "Discretisation",
+    "Discretization",
     "GISMode",
     "GlobalInformationSelector",
     "ImageBackbone",
@@ -34,3 +35,5 @@ __all__ = [
     "recompute_stages",
     "selective_scan",
 ]
+
+__getattr__ = renamed(__name__, {"Discretisation": "Discretization"})

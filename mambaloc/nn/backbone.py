@@ -58,7 +58,7 @@ class ImageBackbone(nn.Module):
         """The module whose weights a file holds."""
         return self.body
 
-    def normalised(self, image: Tensor) -> Tensor:
+    def normalized(self, image: Tensor) -> Tensor:
         """What the body sees of an image in 0..1."""
         return ((image - self.pixel_mean) / self.pixel_std).contiguous(memory_format=torch.channels_last)
 
@@ -145,7 +145,7 @@ class Backbone(ImageBackbone):
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """Normalise the image and return its feature maps, finest first."""
-        return self.body(self.normalised(image))
+        return self.body(self.normalized(image))
 
     @torch.no_grad()
     def grids(self, image_size: tuple[int, int]) -> list[tuple[int, int]]:
@@ -187,7 +187,7 @@ class PooledBackbone(ImageBackbone):
 
     def forward(self, image: Tensor) -> Tensor:
         """Normalise the image and return its feature."""
-        return self.body(self.normalised(image))
+        return self.body(self.normalized(image))
 
 
 def _timm_model(name: str, weights: str | None, timm_args: dict[str, Any] | None, **cut: Any) -> Any:

@@ -47,7 +47,7 @@ class SplitBackbone:
     @torch.no_grad()
     def frozen(self, image: Tensor) -> list[Tensor]:
         """Images, (B, 3, H, W) in 0..1, to the features that :meth:`trained` goes on from; a few (B, C, h, w)."""
-        maps = _listed(self._first(self.backbone.normalised(image)))
+        maps = _listed(self._first(self.backbone.normalized(image)))
         kept = [each for each, is_frozen in zip(maps, self._is_frozen, strict=True) if is_frozen]
         if all(self._is_frozen) or (kept and kept[-1] is maps[-1]):
             return kept
@@ -72,7 +72,7 @@ class SplitBackbone:
         backbone.eval()
         try:
             whole = backbone(image)
-            self._is_list, maps = isinstance(whole, list), _listed(self._first(backbone.normalised(image)))
+            self._is_list, maps = isinstance(whole, list), _listed(self._first(backbone.normalized(image)))
             self._is_frozen = [_agree(one, other) for one, other in zip(maps, _listed(whole), strict=True)]
             again = _listed(self.trained(self.frozen(image)))
             if not all(_agree(one, other) for one, other in zip(again, _listed(whole), strict=True)):

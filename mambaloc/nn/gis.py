@@ -6,7 +6,7 @@ from typing import Literal
 
 from torch import Tensor, nn
 
-from mambaloc.nn.ssm import Discretisation, MambaMixer
+from mambaloc.nn.ssm import Discretization, MambaMixer
 
 GISMode = Literal["none", "classical", "gis"]
 
@@ -32,7 +32,7 @@ class GlobalInformationSelector(nn.Module):
         dim: int,
         mode: Literal["classical", "gis"] = "gis",
         d_state: int = 16,
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
     ) -> None:
         super().__init__()
         if mode not in ("classical", "gis"):
@@ -47,7 +47,7 @@ class GlobalInformationSelector(nn.Module):
         return self.mixer.last_of_two(feats_BD.flip(-1), feats_BD)
 
 
-def build_gis(mode: GISMode, dim: int, discretisation: Discretisation = "euler") -> nn.Module:
+def build_gis(mode: GISMode, dim: int, discretisation: Discretization = "euler") -> nn.Module:
     """Build a host's block for its ``gis=`` option: the identity for ``none``."""
     if mode == "none":
         return nn.Identity()

@@ -6,6 +6,7 @@ from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import deprecated
 
 from mambaloc.geometry import quaternion_from_log
 from mambaloc.types import PosePrediction
@@ -67,17 +68,22 @@ class PositionScale(nn.Module):
         spread_m = (position_m - position_m.mean(0)).square().sum(-1).mean().sqrt().clamp_min(1e-3)
         self.scale_m.view(-1)[scene] = spread_m
 
-    def normalise(self, position_m: Tensor) -> Tensor:
+    def normalize(self, position_m: Tensor) -> Tensor:
         """Tell positions in metres relative to the mean and scale of the only scene; (..., 3) -> (..., 3)."""
         return (position_m - self.mean_m) / self.scale_m
 
-    def forward(self, normalised: Tensor, scene: Tensor | None = None) -> Tensor:
-        """Undo the normalisation."""
+    @deprecated("PositionScale.normalise is now normalize. The old name is removed in the next release.")
+    def normalise(self, position_m: Tensor) -> Tensor:
+        """Normalize positions. Deprecated: removed in the next release."""
+        return self.normalize(position_m)
+
+    def forward(self, normalized: Tensor, scene: Tensor | None = None) -> Tensor:
+        """Undo the normalization; (..., 3) -> (..., 3), metres."""
         mean_m, scale_m = self.mean_m, self.scale_m
         if scene is not None:
-            between = (1,) * (normalised.dim() - 2)
+            between = (1,) * (normalized.dim() - 2)
             mean_m, scale_m = mean_m[scene].view(-1, *between, 3), scale_m[scene].view(-1, *between, 1)
-        return normalised * scale_m + mean_m
+        return normalized * scale_m + mean_m
 
 
 class PoseHead(nn.Module):

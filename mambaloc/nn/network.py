@@ -69,7 +69,7 @@ class PoseNetwork(nn.Module):
         return self.head(*branches)
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None) -> PosePrediction:
-        """Localise images.
+        """Localize images.
 
         Args:
             image: (B, 3, H, W) in 0..1.

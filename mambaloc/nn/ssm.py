@@ -12,11 +12,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-Discretisation = Literal["euler", "zoh"]
+Discretization = Literal["euler", "zoh"]
 
 
-def discretised_input(
-    dt_BLE: Tensor, A_ES: Tensor, B_BLS: Tensor, x_BLE: Tensor, discretisation: Discretisation
+def discretized_input(
+    dt_BLE: Tensor, A_ES: Tensor, B_BLS: Tensor, x_BLE: Tensor, discretisation: Discretization
 ) -> Tensor:
     """Return ``B_bar * x``, what each step adds to the state, (B, L, E, S).
 
@@ -34,7 +34,7 @@ def selective_scan(
     B_BLS: Tensor,
     C_BLS: Tensor,
     D_E: Tensor,
-    discretisation: Discretisation = "euler",
+    discretisation: Discretization = "euler",
 ) -> Tensor:
     """Run ``h_t = exp(dt_t A) h_(t-1) + B_bar_t x_t``, ``y_t = C_t . h_t + D x_t`` over any length; (B, L, E).
 
@@ -42,7 +42,7 @@ def selective_scan(
     would make the backward pass quadratic in L.
     """
     decay_BLES = torch.exp(dt_BLE.unsqueeze(-1) * A_ES)
-    update_BLES = discretised_input(dt_BLE, A_ES, B_BLS, x_BLE, discretisation)
+    update_BLES = discretized_input(dt_BLE, A_ES, B_BLS, x_BLE, discretisation)
     state_BES = torch.zeros_like(update_BLES[:, 0])
     outputs = []
     for decay, update, C_BS in zip(decay_BLES.unbind(1), update_BLES.unbind(1), C_BLS.unbind(1), strict=True):
@@ -73,7 +73,7 @@ class MambaMixer(nn.Module):
         d_conv: int = 4,
         expand: int = 1,
         dt_rank: int | None = None,
-        discretisation: Discretisation = "euler",
+        discretisation: Discretization = "euler",
     ) -> None:
         super().__init__()
         if discretisation not in ("euler", "zoh"):
@@ -128,7 +128,7 @@ class MambaMixer(nn.Module):
         dt_B2E, B_B2S, C_B2S = self._select(x_B2E)
 
         A_ES = -self.A_log.exp()
-        update_B2ES = discretised_input(dt_B2E, A_ES, B_B2S, x_B2E, self.discretisation)
+        update_B2ES = discretized_input(dt_B2E, A_ES, B_B2S, x_B2E, self.discretisation)
         state_BES = torch.exp(dt_B2E[:, 1].unsqueeze(-1) * A_ES) * update_B2ES[:, 0] + update_B2ES[:, 1]
         y_BE = (state_BES * C_B2S[:, 1].unsqueeze(1)).sum(-1) + self.D * x_B2E[:, 1]
         return self.out_proj(y_BE * F.silu(gate_B2E[:, 1]))

@@ -59,7 +59,7 @@ def render(
     rgb = _paint(room, index, inverse_depth, windows, quad_from_pixel)
     if samples > 1:
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    return rgb, _depth_at_centres(index, quad_from_pixel[:, 2], samples)
+    return rgb, _depth_at_centers(index, quad_from_pixel[:, 2], samples)
 
 
 def sensor(rgb: Image, rng: np.random.Generator) -> Image:
@@ -195,7 +195,7 @@ def _lookup(target: Image, where: NDArray[np.bool_], texture: Image, quad_from_p
     cv2.copyTo(seen, where[y0:y1, x0:x1].view(np.uint8), target[y0:y1, x0:x1])
 
 
-def _depth_at_centres(index: NDArray[np.int16], depth_planes: Vectors, samples: int) -> NDArray[np.float32]:
+def _depth_at_centers(index: NDArray[np.int16], depth_planes: Vectors, samples: int) -> NDArray[np.float32]:
     middle = index[samples // 2 :: samples, samples // 2 :: samples]
     planes = np.vstack([depth_planes, np.zeros(3)]).astype(np.float32)[middle]  # -1 finds the zeros at the end
     offset = np.float32((samples - 1) / 2)

@@ -118,7 +118,7 @@ def _wall(paint: Paint, surface: Image, run: float, height: float, deck: _Deck, 
         x += piece.width_m + paint.rng.uniform(0.08, 0.5)
 
     rows, columns = surface.shape[:2]
-    cv2.rectangle(surface, (0, rows - paint.px(0.09)), (columns, rows), paint.colour(0.2, 0.7), cv2.FILLED)
+    cv2.rectangle(surface, (0, rows - paint.px(0.09)), (columns, rows), paint.color(0.2, 0.7), cv2.FILLED)
     for _ in range(round(30 * run)):
         w, h = paint.rng.uniform(0.28, 0.85, 2)
         left, bottom = paint.rng.uniform((0.05, 0.5), (max(0.06, run - w - 0.05), max(0.51, height - h - 0.06)))
@@ -147,7 +147,7 @@ def _hang(surface: Image, picture: Image, x: int, y: int) -> None:
 
 def _ceiling(paint: Paint, length: float, width: float, height: float) -> list[Quad]:
     """A stained ceiling and the lamps under it."""
-    image = plaster(paint, length, width, paint.colour(0.12, 0.85))
+    image = plaster(paint, length, width, paint.color(0.12, 0.85))
     grid = tiles(paint, length, width, 0.62, [(238, 236, 228), (226, 226, 220), (214, 216, 216)])
     image = mixed(image, grid, np.full(image.shape[:2], 0.55, dtype=np.float32))
     quads = [quad((-length / 2, -width / 2, height), (length, 0, 0), (0, width, 0), image)]
@@ -156,37 +156,37 @@ def _ceiling(paint: Paint, length: float, width: float, height: float) -> list[Q
         x, y = (k + 0.5) / count * length - length / 2, paint.rng.uniform(-0.2, 0.2) * width
         w, d = paint.rng.uniform((0.5, 0.25), (1.0, 0.5))
         lower, upper = (x - w / 2, y - d / 2, height - 0.09), (x + w / 2, y + d / 2, height)
-        quads += box(lower, upper, partial(plain, paint, colour=(120, 120, 126)), omit=("bottom", "top"))
+        quads += box(lower, upper, partial(plain, paint, color=(120, 120, 126)), omit=("bottom", "top"))
         quads.append(quad(lower, (w, 0, 0), (0, d, 0), plain(paint, w, d, (255, 244, 222), 0.02), glows=True))
     return quads
 
 
 def _floor(paint: Paint, length: float, width: float) -> Quad:
     """Planks under rugs of different patterns."""
-    image = wood(paint, length, width, paint.colour(0.5, 0.6, hue=paint.rng.uniform(0.06, 0.09)))
+    image = wood(paint, length, width, paint.color(0.5, 0.6, hue=paint.rng.uniform(0.06, 0.09)))
     for k in range(3):
         w, d = paint.rng.uniform((1.0, 0.7), (1.9, 1.2))
         x, y = np.array([0.5 + 0.3 * (k - 1), 0.5]) + paint.rng.uniform(-1, 1, 2) * (0.06, 0.2)
-        centre_px = np.array([x * length, y * width]) * paint.px_per_m
-        _lay(image, _rug(paint, w, d), centre_px, paint.rng.uniform(0, 180))
+        center_px = np.array([x * length, y * width]) * paint.px_per_m
+        _lay(image, _rug(paint, w, d), center_px, paint.rng.uniform(0, 180))
     return quad((-length / 2, width / 2, 0), (length, 0, 0), (0, -width, 0), image)
 
 
 def _rug(paint: Paint, width: float, depth: float) -> Image:
-    rug = tiles(paint, width, depth, paint.rng.uniform(0.06, 0.16), [paint.colour(0.6, 0.55) for _ in range(4)])
+    rug = tiles(paint, width, depth, paint.rng.uniform(0.06, 0.16), [paint.color(0.6, 0.55) for _ in range(4)])
     rows, columns = rug.shape[:2]
     for k, edge in enumerate((0.0, 0.06, 0.12)):
         corner = paint.px(edge)
-        colour = paint.colour(0.6, 0.3 + 0.25 * k)
-        cv2.rectangle(rug, (corner, corner), (columns - 1 - corner, rows - 1 - corner), colour, paint.px(0.04))
+        color = paint.color(0.6, 0.3 + 0.25 * k)
+        cv2.rectangle(rug, (corner, corner), (columns - 1 - corner, rows - 1 - corner), color, paint.px(0.04))
     return rug
 
 
-def _lay(floor: Image, rug: Image, centre_px: Vectors, turn_deg: float) -> None:
+def _lay(floor: Image, rug: Image, center_px: Vectors, turn_deg: float) -> None:
     """Paint a rug onto the floor, turned about its middle."""
     rows, columns = rug.shape[:2]
     move = cv2.getRotationMatrix2D((columns / 2, rows / 2), turn_deg, 1.0)
-    move[:, 2] += centre_px - (columns / 2, rows / 2)
+    move[:, 2] += center_px - (columns / 2, rows / 2)
     size = floor.shape[1::-1]
     cover = cv2.warpAffine(np.full((rows, columns), 255, dtype=np.uint8), move, size)
     cv2.copyTo(cv2.warpAffine(rug, move, size), (cover > 127).astype(np.uint8), floor)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.rendering.quads import Image
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 Field = NDArray[np.float32]
 
 
@@ -26,12 +26,12 @@ class Paint:
         """A length in texels, at least 1."""
         return max(1, round(length_m * self.px_per_m))
 
-    def canvas(self, width_m: float, height_m: float, colour: ArrayLike = (0, 0, 0)) -> Image:
+    def canvas(self, width_m: float, height_m: float, color: ArrayLike = (0, 0, 0)) -> Image:
         """An image (H, W, 3) of one colour, at least 4 texels wide and high."""
         shape = (max(4, self.px(height_m)), max(4, self.px(width_m)), 3)
-        return np.full(shape, colour).astype(np.uint8)
+        return np.full(shape, color).astype(np.uint8)
 
-    def colour(self, saturation: float = 0.6, value: float = 0.7, hue: float | None = None) -> Colour:
+    def color(self, saturation: float = 0.6, value: float = 0.7, hue: float | None = None) -> Color:
         """A colour of any hue near a given saturation and value, RGB 0..255."""
         h, ds, dv = self.rng.uniform((0, -0.12, -0.12), (1, 0.12, 0.12))
         s, v = np.clip([saturation + ds, value + dv], 0, 1)
@@ -64,13 +64,13 @@ def scaled(image: Image, factor: ArrayLike) -> Image:
     return np.clip(image * (factor[..., None] if factor.ndim == 2 else factor), 0, 255).astype(np.uint8)
 
 
-def darker(colour: Colour, factor: float) -> Colour:
+def darker(color: Color, factor: float) -> Color:
     """The colour with its brightness multiplied by ``factor``."""
-    r, g, b = (min(255.0, factor * channel) for channel in colour)
+    r, g, b = (min(255.0, factor * channel) for channel in color)
     return (r, g, b)
 
 
-def wood(paint: Paint, width_m: float, height_m: float, colour: Colour, plank_m: float = 0.14) -> Image:
+def wood(paint: Paint, width_m: float, height_m: float, color: Color, plank_m: float = 0.14) -> Image:
     """Planks along the width, each with its own tone and grain."""
     image = paint.canvas(width_m, height_m)
     height, width = image.shape[:2]
@@ -85,23 +85,23 @@ def wood(paint: Paint, width_m: float, height_m: float, colour: Colour, plank_m:
             left = right
         tone[top : top + 1] = 0.5
     grain = 0.62 + 0.55 * paint.noise((height, width), 0.03, stretch=14)
-    return scaled(paint.canvas(width_m, height_m, colour), tone * grain)
+    return scaled(paint.canvas(width_m, height_m, color), tone * grain)
 
 
-def plain(paint: Paint, width_m: float, height_m: float, colour: Colour, rough: float = 0.12) -> Image:
+def plain(paint: Paint, width_m: float, height_m: float, color: Color, rough: float = 0.12) -> Image:
     """Paint or laminate: one colour, a little uneven, its edges worn lighter."""
-    image = paint.canvas(width_m, height_m, colour)
+    image = paint.canvas(width_m, height_m, color)
     uneven = 1 - rough / 2 + rough * paint.noise(image.shape[:2], 0.15)
     height, width = image.shape[:2]
     image = scaled(image, uneven)
-    edge = tuple(int(min(255, 1.15 * c + 12)) for c in colour)
+    edge = tuple(int(min(255, 1.15 * c + 12)) for c in color)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), edge, 1)
     return image
 
 
-def cloth(paint: Paint, width_m: float, height_m: float, colour: Colour) -> Image:
+def cloth(paint: Paint, width_m: float, height_m: float, color: Color) -> Image:
     """Woven cloth with a coarse random check."""
-    image = paint.canvas(width_m, height_m, colour)
+    image = paint.canvas(width_m, height_m, color)
     height, width = image.shape[:2]
     weave = paint.rng.uniform(0.9, 1.1, (height, width)).astype(np.float32)
     pitch = paint.px(paint.rng.uniform(0.05, 0.12))
@@ -113,42 +113,42 @@ def cloth(paint: Paint, width_m: float, height_m: float, colour: Colour) -> Imag
 
 def brick(paint: Paint, width_m: float, height_m: float) -> Image:
     """A brick wall in running bond, some bricks burnt darker."""
-    base = paint.colour(0.5, 0.62, hue=paint.rng.uniform(0.01, 0.06))
+    base = paint.color(0.5, 0.62, hue=paint.rng.uniform(0.01, 0.06))
     image = paint.canvas(width_m, height_m, (196, 188, 176))
     height, width = image.shape[:2]
     course, length, joint = paint.px(0.085), paint.px(0.25), max(1, paint.px(0.011))
     for row, top in enumerate(range(0, height, course)):
         for left in range(-(row % 2) * length // 2, width, length):
-            colour = darker(base, paint.rng.choice([0.62, 1.0, 1.0, 1.0, 1.22]) * paint.rng.uniform(0.85, 1.12))
+            color = darker(base, paint.rng.choice([0.62, 1.0, 1.0, 1.0, 1.22]) * paint.rng.uniform(0.85, 1.12))
             x1, y1 = left + length - joint - 1, top + course - joint - 1
-            cv2.rectangle(image, (max(0, left), top), (x1, y1), colour, cv2.FILLED)
+            cv2.rectangle(image, (max(0, left), top), (x1, y1), color, cv2.FILLED)
     return scaled(image, 0.72 + 0.5 * paint.noise((height, width), 0.4, octaves=6))
 
 
 def wallpaper(paint: Paint, width_m: float, height_m: float) -> Image:
     """Striped wallpaper with flowers strewn at random, no two strips alike."""
-    base = paint.colour(0.16, 0.88)
+    base = paint.color(0.16, 0.88)
     image = paint.canvas(width_m, height_m, base)
     height, width = image.shape[:2]
     for left in range(0, width, paint.px(0.36)):
-        colour = darker(base, paint.rng.uniform(0.82, 1.08))
-        cv2.rectangle(image, (left, 0), (left + paint.px(paint.rng.uniform(0.08, 0.26)), height), colour, cv2.FILLED)
-    petals = [paint.colour(0.5, 0.62) for _ in range(4)]
+        color = darker(base, paint.rng.uniform(0.82, 1.08))
+        cv2.rectangle(image, (left, 0), (left + paint.px(paint.rng.uniform(0.08, 0.26)), height), color, cv2.FILLED)
+    petals = [paint.color(0.5, 0.62) for _ in range(4)]
     for _ in range(int(9 * width_m * height_m)):
         x, y = (int(v) for v in paint.rng.integers(0, (width, height)))
         size, count, angle = paint.px(paint.rng.uniform(0.02, 0.045)), paint.rng.integers(4, 8), paint.rng.uniform(0, 6)
         petal = petals[paint.rng.integers(len(petals))]
         for k in range(count):
             turn = angle + 2 * np.pi * k / count
-            centre = (round(x + size * np.cos(turn)), round(y + size * np.sin(turn)))
-            cv2.circle(image, centre, max(1, round(0.6 * size)), petal, cv2.FILLED, cv2.LINE_AA)
+            center = (round(x + size * np.cos(turn)), round(y + size * np.sin(turn)))
+            cv2.circle(image, center, max(1, round(0.6 * size)), petal, cv2.FILLED, cv2.LINE_AA)
         cv2.circle(image, (x, y), max(1, size // 2), (236, 220, 130), cv2.FILLED, cv2.LINE_AA)
     return scaled(image, 0.9 + 0.2 * paint.noise((height, width), 0.8))
 
 
-def plaster(paint: Paint, width_m: float, height_m: float, colour: Colour | None = None) -> Image:
+def plaster(paint: Paint, width_m: float, height_m: float, color: Color | None = None) -> Image:
     """Old plaster: cloudy, with damp stains and cracks."""
-    base = colour or paint.colour(0.18, 0.84)
+    base = color or paint.color(0.18, 0.84)
     image = paint.canvas(width_m, height_m)
     height, width = image.shape[:2]
     image = mixed(darker(base, 0.78), darker(base, 1.1), paint.noise((height, width), 0.7, octaves=6))
@@ -164,10 +164,10 @@ def plaster(paint: Paint, width_m: float, height_m: float, colour: Colour | None
 
 def panelling(paint: Paint, width_m: float, height_m: float) -> Image:
     """A painted wall above panels of wood as high as a table."""
-    image = plaster(paint, width_m, height_m, paint.colour(0.35, 0.78))
+    image = plaster(paint, width_m, height_m, paint.color(0.35, 0.78))
     height, width = image.shape[:2]
     top = max(0, height - paint.px(1.05))
-    oak = paint.colour(0.5, 0.55, hue=paint.rng.uniform(0.06, 0.1))
+    oak = paint.color(0.5, 0.55, hue=paint.rng.uniform(0.06, 0.1))
     boards = wood(paint, 1.05, width_m, oak, plank_m=0.6).transpose(1, 0, 2)
     image[top:] = cv2.resize(boards, (width, height - top), interpolation=cv2.INTER_AREA)
     rail, step = paint.px(0.04), paint.px(0.6)
@@ -181,10 +181,10 @@ def panelling(paint: Paint, width_m: float, height_m: float) -> Image:
     return image
 
 
-def tiles(paint: Paint, width_m: float, height_m: float, tile_m: float, colours: list[Colour]) -> Image:
+def tiles(paint: Paint, width_m: float, height_m: float, tile_m: float, colors: list[Color]) -> Image:
     """Square tiles in colours drawn at random, with grey joints."""
     size = (int(height_m / tile_m) + 1, int(width_m / tile_m) + 1)
-    picks = np.asarray(colours)[paint.rng.integers(len(colours), size=size)] * paint.rng.uniform(0.9, 1.1, (*size, 1))
+    picks = np.asarray(colors)[paint.rng.integers(len(colors), size=size)] * paint.rng.uniform(0.9, 1.1, (*size, 1))
     tile = max(2, paint.px(tile_m))
     height, width = paint.canvas(width_m, height_m).shape[:2]
     rows, columns = np.arange(height) // tile, np.arange(width) // tile

@@ -14,9 +14,9 @@ import numpy as np
 from mambaloc.errors import InputError
 from mambaloc.files import sha256
 from mambaloc.images import read_image
-from mambaloc.runtime.localisation import Localisation
-from mambaloc.runtime.localiser import Localiser
-from mambaloc.runtime.maps import MAP_FILE, MapLocaliser, SparseMap
+from mambaloc.runtime.localization import Localization
+from mambaloc.runtime.localizer import Localizer
+from mambaloc.runtime.maps import MAP_FILE, MapLocalizer, SparseMap
 from mambaloc.runtime.rotations import rotation_error_deg
 
 CONTRACT_FILE = "contract.json"
@@ -99,29 +99,29 @@ def _deviation(file: str, largest: Replay, entry: dict[str, Any]) -> Deviation:
 
 
 def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None) -> Replay:
-    """Let a model localise its bundle's frames: largest deviation in mm and degrees, and median latency in ms."""
-    localiser = Localiser(model, threads)
-    found = [(localiser.localise(model.parent / frame["file"], frame.get("intrinsics")), frame) for frame in frames]
+    """Let a model localize its bundle's frames: largest deviation in mm and degrees, and median latency in ms."""
+    localizer = Localizer(model, threads)
+    found = [(localizer.localize(model.parent / frame["file"], frame.get("intrinsics")), frame) for frame in frames]
     in_scene = [  # frames are told in their scene's frame, as the models say them
-        (replace(pose, position_m=pose.position_m - localiser.world_of(pose).offset_m), frame) for pose, frame in found
+        (replace(pose, position_m=pose.position_m - localizer.world_of(pose).offset_m), frame) for pose, frame in found
     ]
     return _compared(in_scene)
 
 
 def replay_map(folder: Path, frames: list[dict[str, Any]]) -> Replay:
-    """The same of a bundle's map, over the frames that it localised when the bundle was written."""
-    localiser = MapLocaliser(SparseMap.load(folder / MAP_FILE))
+    """The same of a bundle's map, over the frames that it localized when the bundle was written."""
+    localizer = MapLocalizer(SparseMap.load(folder / MAP_FILE))
     found = []
     for frame in frames:
         if (expected := frame["map"]) is not None:
             rgb, start = read_image(folder / frame["file"]), time.perf_counter()
-            pose = localiser.localise(rgb, frame["intrinsics"])
+            pose = localizer.localize(rgb, frame["intrinsics"])
             latency_s = time.perf_counter() - start
-            found.append((Localisation(pose.position_m, pose.quaternion, latency_s), expected))
+            found.append((Localization(pose.position_m, pose.quaternion, latency_s), expected))
     return _compared(found)
 
 
-def _compared(pairs: Sequence[tuple[Localisation, dict[str, Any]]]) -> Replay:
+def _compared(pairs: Sequence[tuple[Localization, dict[str, Any]]]) -> Replay:
     if not pairs:
         return 0.0, 0.0, float("nan")
     off_mm = [1000 * np.linalg.norm(pose.position_m - np.array(expected["position_m"])) for pose, expected in pairs]

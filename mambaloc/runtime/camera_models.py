@@ -38,7 +38,7 @@ class Pinhole:
     width: int
     height: int
     focal_px: tuple[float, float]
-    centre_px: tuple[float, float]
+    center_px: tuple[float, float]
 
     @property
     def size(self) -> Size:
@@ -48,7 +48,7 @@ class Pinhole:
     @property
     def intrinsics(self) -> Floats:
         """The pinhole matrix, (3, 3)."""
-        return matrix_of(self.focal_px, self.centre_px)
+        return matrix_of(self.focal_px, self.center_px)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class CameraModel(ABC):
     """
 
     focal_px: tuple[float, float]
-    centre_px: tuple[float, float]
+    center_px: tuple[float, float]
     coefficients: Sequence[float]
 
     name: ClassVar[str]
@@ -82,8 +82,8 @@ class CameraModel(ABC):
 
     def scaled(self, scale: Sequence[float]) -> Self:
         """The same of pictures resized by factors of width and height."""
-        focal, centre = scaled_intrinsics(self.focal_px, self.centre_px, scale)
-        return replace(self, focal_px=focal, centre_px=centre)
+        focal, center = scaled_intrinsics(self.focal_px, self.center_px, scale)
+        return replace(self, focal_px=focal, center_px=center)
 
 
 @dataclass(frozen=True)
@@ -96,12 +96,12 @@ class OpenCVModel(CameraModel):
     def __call__(self, rays: Floats) -> Floats:
         """Pixels of rays, both (N, 2)."""
         points = np.concatenate((rays, np.ones((len(rays), 1))), axis=1)[:, None]
-        matrix, none = matrix_of(self.focal_px, self.centre_px), np.zeros(3)
+        matrix, none = matrix_of(self.focal_px, self.center_px), np.zeros(3)
         return cv2.projectPoints(points, none, none, matrix, np.array(self.coefficients))[0][:, 0].astype(np.float64)
 
     def of_pixels(self, pinhole: Pinhole) -> NDArray[np.float32]:
         """Pixels of a pinhole's pixels, (H, W, 2) float32."""
-        matrix, told = matrix_of(self.focal_px, self.centre_px), np.array(self.coefficients)
+        matrix, told = matrix_of(self.focal_px, self.center_px), np.array(self.coefficients)
         maps = cv2.initUndistortRectifyMap(matrix, told, None, pinhole.intrinsics, pinhole.size, cv2.CV_32FC1)
         return np.dstack(maps)
 
@@ -115,12 +115,12 @@ class FisheyeModel(CameraModel):
 
     def __call__(self, rays: Floats) -> Floats:
         """Pixels of rays, both (N, 2)."""
-        points, matrix = np.ascontiguousarray(rays)[:, None], matrix_of(self.focal_px, self.centre_px)
+        points, matrix = np.ascontiguousarray(rays)[:, None], matrix_of(self.focal_px, self.center_px)
         return cv2.fisheye.distortPoints(points, matrix, np.array(self.coefficients))[:, 0].astype(np.float64)
 
     def of_pixels(self, pinhole: Pinhole) -> NDArray[np.float32]:
         """Pixels of a pinhole's pixels, (H, W, 2) float32."""
-        matrix, told = matrix_of(self.focal_px, self.centre_px), np.array(self.coefficients)
+        matrix, told = matrix_of(self.focal_px, self.center_px), np.array(self.coefficients)
         maps = cv2.fisheye.initUndistortRectifyMap(
             matrix, told, np.eye(3), pinhole.intrinsics, pinhole.size, cv2.CV_32FC1
         )
@@ -138,26 +138,26 @@ def is_same_shape(size: Sequence[float], other: Sequence[float]) -> bool:
 
 
 def scaled_intrinsics(
-    focal_px: Sequence[float], centre_px: Sequence[float], scale: Sequence[float]
+    focal_px: Sequence[float], center_px: Sequence[float], scale: Sequence[float]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Focal lengths and principal point in pictures resized by factors of width and height; corners stay corners."""
-    (fx, fy), (cx, cy), (x, y) = focal_px, centre_px, scale
+    (fx, fy), (cx, cy), (x, y) = focal_px, center_px, scale
     return (fx * x, fy * y), ((cx + CORNER_PX) * x - CORNER_PX, (cy + CORNER_PX) * y - CORNER_PX)
 
 
-def matrix_of(focal_px: Sequence[float], centre_px: Sequence[float]) -> Floats:
+def matrix_of(focal_px: Sequence[float], center_px: Sequence[float]) -> Floats:
     """The pinhole matrix of focal lengths and principal point, (3, 3)."""
-    return np.array([[focal_px[0], 0, centre_px[0]], [0, focal_px[1], centre_px[1]], [0, 0, 1]])
+    return np.array([[focal_px[0], 0, center_px[0]], [0, focal_px[1], center_px[1]], [0, 0, 1]])
 
 
-def numbers_to_json(size: Size, focal_px: Sequence[float], centre_px: Sequence[float]) -> dict[str, Any]:
+def numbers_to_json(size: Size, focal_px: Sequence[float], center_px: Sequence[float]) -> dict[str, Any]:
     """Size, focal lengths and principal point as ``scene.json`` and contracts have them."""
-    return {"width": size[0], "height": size[1], "focal_px": list(focal_px), "centre_px": list(centre_px)}
+    return {"width": size[0], "height": size[1], "focal_px": list(focal_px), "centre_px": list(center_px)}
 
 
 def model_to_json(model: CameraModel, size: Size) -> dict[str, Any]:
     """The same of a camera that distorts."""
-    numbers = numbers_to_json(size, model.focal_px, model.centre_px)
+    numbers = numbers_to_json(size, model.focal_px, model.center_px)
     return {"opencv": model.name, **numbers, "coefficients": list(model.coefficients)}
 
 
@@ -183,7 +183,7 @@ def model_from_json(value: Mapping[str, Any]) -> tuple[CameraModel, Size]:
         KeyError, TypeError, ValueError, OverflowError: for anything else.
     """
     told = pinhole_from_json(value)
-    model = MODELS[value["opencv"]](told.focal_px, told.centre_px, value["coefficients"])
+    model = MODELS[value["opencv"]](told.focal_px, told.center_px, value["coefficients"])
     if len(model.coefficients) not in model.counts or not all(map(math.isfinite, model.coefficients)):
         raise ValueError(f"coefficients {model.coefficients}")
     return model, told.size

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mambaloc.errors import InputError
 from mambaloc.images import Image
 from mambaloc.runtime.contract import INTRINSICS_INPUT, METADATA_KEY, SCENE_PROBABILITY, UNCERTAINTY, Contract
-from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.maps.features import check_intrinsics
 
 
@@ -46,8 +46,8 @@ class Network:
         self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
         self._check_input()
 
-    def localise(self, rgb: Image, intrinsics: ArrayLike | None = None) -> Localisation:
-        """Localise an RGB image (H, W, 3), ``uint8``.
+    def localize(self, rgb: Image, intrinsics: ArrayLike | None = None) -> Localization:
+        """Localize an RGB image (H, W, 3), ``uint8``.
 
         Args:
             rgb: the image.
@@ -65,7 +65,7 @@ class Network:
             dict(zip(self.contract.outputs, (each[0] for each in said), strict=True)),
         )
         radius_m, radius_deg, unfamiliarity = (float(found[name]) if name in found else None for name in UNCERTAINTY)
-        answer = Localisation(
+        answer = Localization(
             found["position_m"], found["quaternion_wxyz"], taken_s, radius_m, radius_deg, unfamiliarity
         )
         if not self.contract.scenes:

@@ -74,7 +74,7 @@ def frames_of(
     if about.hdr:
         warnings.warn(
             f"{path}: is a film with a high dynamic range ({about.hdr}), whose frames look flat beside other pictures. "
-            "Record with HDR off, or convert it to SDR, and use such films alone for training and localising.",
+            "Record with HDR off, or convert it to SDR, and use such films alone for training and localizing.",
             InputWarning,
             stacklevel=2,
         )

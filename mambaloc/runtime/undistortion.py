@@ -88,7 +88,7 @@ class Undistortion:
         return {
             "function": FUNCTION,
             "lens": model_to_json(self.lens, self.stored),
-            "leaves": numbers_to_json(left.size, left.focal_px, left.centre_px),
+            "leaves": numbers_to_json(left.size, left.focal_px, left.center_px),
         }
 
     @classmethod
@@ -109,7 +109,7 @@ class Undistortion:
         if left.width > stored[0] or left.height > stored[1]:
             raise ValueError("lens: it leaves larger pictures than it is given")
         corners = np.array([(x, y) for x in (0.0, left.width - 1) for y in (0.0, left.height - 1)])
-        seen = lens((corners - left.centre_px) / left.focal_px)
+        seen = lens((corners - left.center_px) / left.focal_px)
         if not ((seen > -1) & (seen < stored)).all():
             raise ValueError("lens: its pictures do not fill those that are left")
         return cls(lens, stored, left, "")
@@ -133,7 +133,7 @@ def sampled_at(projected: Callable[[Floats], Floats], pinhole: Pinhole) -> Maps:
     else:
         columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
         pixels = np.stack((columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
-        seen = projected((pixels - pinhole.centre_px) / pinhole.focal_px).reshape(pinhole.height, pinhole.width, 2)
+        seen = projected((pixels - pinhole.center_px) / pinhole.focal_px).reshape(pinhole.height, pinhole.width, 2)
     # What no lens sees is outside.
     seen = np.clip(np.nan_to_num(seen, nan=-1.0), -LARGEST_SIDE_PX, 2 * LARGEST_SIDE_PX).astype(np.float32)
     return np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
@@ -146,5 +146,5 @@ def _fitted(lens: CameraModel, stored: Size, left: Pinhole, size: Size) -> tuple
         scale = size[0] / stored[0], size[1] / stored[1]
         width, height = (max(1, round(side * by)) for side, by in zip(left.size, scale, strict=True))
         by = width / left.width, height / left.height
-        lens, left = lens.scaled(scale), Pinhole(width, height, *scaled_intrinsics(left.focal_px, left.centre_px, by))
+        lens, left = lens.scaled(scale), Pinhole(width, height, *scaled_intrinsics(left.focal_px, left.center_px, by))
     return sampled_at(lens, left), left

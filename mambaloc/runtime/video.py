@@ -1,4 +1,4 @@
-"""Localise a whole source, filter its poses, and write its trajectory."""
+"""Localize a whole source, filter its poses, and write its trajectory."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from rich.progress import track
 
 from mambaloc.errors import InputError
 from mambaloc.images import Counts
-from mambaloc.runtime.localisation import Localisation
-from mambaloc.runtime.localiser import Localiser
+from mambaloc.runtime.localization import Localization
+from mambaloc.runtime.localizer import Localizer
 from mambaloc.runtime.pose_filter import PoseFilter, smooth
 from mambaloc.runtime.sources import SourceFrame, frames_of
 from mambaloc.runtime.trajectory import write_tum
@@ -29,7 +29,7 @@ class Followed:
 
     Args:
         scene: the place.
-        count: frames that were localised.
+        count: frames that were localized.
         lost: frames without a pose, as a map alone may leave.
         from_map: of the poses, those that the map found; None unless it stands beside a network.
         outliers: of the poses, those that a filter left out; None where there was no filter.
@@ -64,22 +64,22 @@ class Followed:
 
 
 def follow(
-    localiser: Localiser,
+    localizer: Localizer,
     source: str,
     out: Path,
     filtering: str | None = None,
     intrinsics: ArrayLike | None = None,
     counts: Counts | None = None,
     is_distorted: bool = False,
-    on_frame: Callable[[SourceFrame, Localisation], None] | None = None,
+    on_frame: Callable[[SourceFrame, Localization], None] | None = None,
 ) -> Followed:
-    """Localise every frame of a source with a progress bar on stderr, and write a TUM trajectory.
+    """Localize every frame of a source with a progress bar on stderr, and write a TUM trajectory.
 
-    Ctrl-C ends it; what was found is written then, and also where a frame cannot be localised. The trajectory's times
+    Ctrl-C ends it; what was found is written then, and also where a frame cannot be localized. The trajectory's times
     are those that the filter takes: seconds since the first frame. It leaves out frames without a pose.
 
     Args:
-        localiser: of the model.
+        localizer: of the model.
         source: as :func:`~mambaloc.runtime.sources.frames_of` takes it.
         out: the trajectory.
         filtering: one of :data:`FILTERS`; poses are written as found unless given.
@@ -89,20 +89,20 @@ def follow(
         on_frame: is given each frame and what was found of it, unfiltered.
 
     Raises:
-        InputError: where there is no such source, it holds no frame, one cannot be localised, none has a pose, or
+        InputError: where there is no such source, it holds no frame, one cannot be localized, none has a pose, or
             ``out`` has no folder.
     """
     if out.is_dir() or not out.absolute().parent.is_dir():
         raise InputError(f"--out {out}: there is no folder to write that file to; make it, or choose another")
     frames, count = frames_of(source, counts=counts)
     console = Console(stderr=True)
-    found: list[tuple[float, Localisation]] = []
-    kept: list[tuple[float, Localisation]] = []
+    found: list[tuple[float, Localization]] = []
+    kept: list[tuple[float, Localization]] = []
     outliers = None
     try:
-        watched = track(frames, "Localising", count, console=console, transient=True)
+        watched = track(frames, "Localizing", count, console=console, transient=True)
         for frame in watched:
-            pose = localiser.localise(frame.image, intrinsics, is_distorted)
+            pose = localizer.localize(frame.image, intrinsics, is_distorted)
             found.append((frame.time_s, pose))  # at once, so that Ctrl-C leaves as many times as poses
             if on_frame is not None:
                 on_frame(frame, pose)
@@ -118,22 +118,22 @@ def follow(
     if not found:
         raise InputError(f"{source}: holds no frame; give another video")
     if not kept:
-        raise InputError(f"{source}: none of its {len(found)} frames was localised. Give frames of the map's place.")
-    return summarise(localiser, [pose for _, pose in found], outliers)
+        raise InputError(f"{source}: none of its {len(found)} frames was localized. Give frames of the map's place.")
+    return summarize(localizer, [pose for _, pose in found], outliers)
 
 
-def summarise(localiser: Localiser, found: Sequence[Localisation], outliers: int | None = None) -> Followed:
+def summarize(localizer: Localizer, found: Sequence[Localization], outliers: int | None = None) -> Followed:
     """Say what became of frames.
 
     Args:
-        localiser: that found their poses.
+        localizer: that found their poses.
         found: a frame's each, at least one with a pose.
         outliers: as of :class:`Followed`.
     """
     poses = [pose for pose in found if pose.source is not None]
-    has_both = localiser.contract is not None and localiser.sparse_map is not None
+    has_both = localizer.contract is not None and localizer.sparse_map is not None
     return Followed(
-        localiser.scene,
+        localizer.scene,
         len(poses),
         len(found) - len(poses),
         sum(pose.source == "map" for pose in poses) if has_both else None,
@@ -144,13 +144,13 @@ def summarise(localiser: Localiser, found: Sequence[Localisation], outliers: int
     )
 
 
-def _median_radii(poses: Sequence[Localisation]) -> tuple[float, float] | None:
+def _median_radii(poses: Sequence[Localization]) -> tuple[float, float] | None:
     radii = [(pose.position_radius_m, pose.rotation_radius_deg) for pose in poses if pose.position_radius_m is not None]
     return tuple(np.median(np.array(radii, np.float64), axis=0).tolist()) if radii else None
 
 
 def _filtered(
-    filtering: str | None, times_s: Sequence[float], poses: Sequence[Localisation]
+    filtering: str | None, times_s: Sequence[float], poses: Sequence[Localization]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], int | None]:
     """Positions (N, 3), quaternions (N, 4), and how many were left out, by a filter."""
     positions_m, quaternions = (np.stack([getattr(pose, of) for pose in poses]) for of in ("position_m", "quaternion"))

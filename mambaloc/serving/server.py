@@ -46,7 +46,7 @@ class Limits:
     Args:
         body_bytes: of a request, whatever its headers say.
         pictures: of a request.
-        waiting: pictures that are localised or wait for it, beyond which requests are turned away with status 503.
+        waiting: pictures that are localized or wait for it, beyond which requests are turned away with status 503.
         is_distorted: pictures are as the training camera stores them, unless a request says otherwise.
     """
 
@@ -62,10 +62,10 @@ class _Metrics:
     def __init__(self, workers: Workers) -> None:
         self.registry = CollectorRegistry()
         told: dict[str, Any] = {"registry": self.registry, "namespace": "mambaloc"}
-        self.requests = Counter("requests", "Requests to localise, by bundle and status", ("bundle", "status"), **told)
+        self.requests = Counter("requests", "Requests to localize, by bundle and status", ("bundle", "status"), **told)
         self.pictures = Counter("pictures", "Pictures, by bundle and what answered", ("bundle", "source"), **told)
         self.seconds = Histogram("picture_seconds", "Of a picture, waiting included", ("bundle",), **told)
-        self.waiting = Gauge("pictures_waiting", "Pictures that are localised or wait for it", **told)
+        self.waiting = Gauge("pictures_waiting", "Pictures that are localized or wait for it", **told)
         Gauge("workers", "Worker processes", **told).set(workers.count)
         replaced = Gauge("workers_replaced", "Workers that died or took too long", **told)
         replaced.set_function(lambda: workers.replaced)
@@ -77,7 +77,7 @@ class _Endpoints:
         self.metrics = _Metrics(workers)
         self.waiting = 0
 
-    async def localise(self, request: Request) -> Response:
+    async def localize(self, request: Request) -> Response:
         """One picture, as the body; or several, as the files of a form, which are answered in their order."""
         name = request.path_params.get("bundle") or next(iter(self.workers.scenes))
         try:
@@ -113,7 +113,7 @@ class _Endpoints:
         if self.waiting + len(pictures) > self.limits.waiting:
             raise HTTPException(503, f"{self.waiting} pictures wait already. Try again later.", {"Retry-After": "1"})
         answers = await asyncio.gather(
-            *(self._localised(Task(name, each, intrinsics, is_distorted)) for each in pictures)
+            *(self._localized(Task(name, each, intrinsics, is_distorted)) for each in pictures)
         )
         if is_form:
             return {"pictures": answers}
@@ -159,14 +159,14 @@ class _Endpoints:
                 raise HTTPException(413, f"body: is larger than {most:g} MiB. Give smaller pictures, or fewer.")
             yield chunk
 
-    async def _localised(self, task: Task) -> Answer:
+    async def _localized(self, task: Task) -> Answer:
         began = time.perf_counter()
         self.waiting += 1
         self.metrics.waiting.set(self.waiting)
         try:
-            answer = await self.workers.localise(task)
+            answer = await self.workers.localize(task)
         except WorkerLostError:
-            raise HTTPException(500, "picture: no worker could localise it. Report it, with the picture.") from None
+            raise HTTPException(500, "picture: no worker could localize it. Report it, with the picture.") from None
         finally:
             self.waiting -= 1
             self.metrics.waiting.set(self.waiting)
@@ -204,8 +204,8 @@ def create_app(workers: Workers, limits: Limits | None = None, token: str | None
     hosts = ["127.0.0.1", "localhost", "[::1]"] if host in LOOPBACK else ["*"]
     return Starlette(
         routes=[
-            Route("/localize", endpoints.localise, methods=["POST"]),
-            Route("/localize/{bundle}", endpoints.localise, methods=["POST"]),
+            Route("/localize", endpoints.localize, methods=["POST"]),
+            Route("/localize/{bundle}", endpoints.localize, methods=["POST"]),
             Route("/health", endpoints.health),
             Route("/metrics", endpoints.prometheus),
         ],

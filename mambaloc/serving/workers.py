@@ -1,4 +1,4 @@
-"""Processes that localise pictures. One that dies or hangs is replaced, and its picture is tried again.
+"""Processes that localize pictures. One that dies or hangs is replaced, and its picture is tried again.
 
 LitServe 0.2.19 and Ray Serve 2.60 were measured beside this (docs/serving.md): with the one, requests of a worker that
 is killed are not answered; with the other, an idle server takes 1.7 GiB.
@@ -24,8 +24,8 @@ from typing import Any
 
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
-from mambaloc.runtime import Localiser
-from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime import Localizer
+from mambaloc.runtime.localization import Localization
 
 _TRIES = 3
 _START_S = 120.0
@@ -42,7 +42,7 @@ Answer = dict[str, Any]
 
 @dataclass(frozen=True)
 class Task:
-    """A picture to localise.
+    """A picture to localize.
 
     Args:
         bundle: name of the bundle.
@@ -65,7 +65,7 @@ class Workers:
     """Worker processes, each with every bundle loaded.
 
     Args:
-        bundles: folders, or other models that :class:`~mambaloc.runtime.Localiser` takes, by name.
+        bundles: folders, or other models that :class:`~mambaloc.runtime.Localizer` takes, by name.
         count: how many processes.
         seconds: that a picture may take before its worker is replaced.
 
@@ -79,16 +79,16 @@ class Workers:
     """
 
     def __init__(self, bundles: Mapping[str, Path], count: int, seconds: float = 30.0) -> None:
-        localisers = {name: Localiser(path, threads=1) for name, path in bundles.items()}
-        self.scenes = {name: each.scene for name, each in localisers.items()}
-        self.without_lens = [name for name, each in localisers.items() if each.undistortion.lens is None]
+        localizers = {name: Localizer(path, threads=1) for name, path in bundles.items()}
+        self.scenes = {name: each.scene for name, each in localizers.items()}
+        self.without_lens = [name for name, each in localizers.items() if each.undistortion.lens is None]
         self.count, self.replaced = count, 0
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
         self._workers = [_Worker(bundles, seconds) for _ in range(count)]
         self._idle: asyncio.Queue[_Worker] = asyncio.Queue()
 
     async def start(self) -> None:
-        """Start all, and wait until they can localise.
+        """Start all, and wait until they can localize.
 
         Raises:
             InputError: where one does not start.
@@ -110,8 +110,8 @@ class Workers:
             worker.stop()
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    async def localise(self, task: Task) -> Answer:
-        """Localise a picture on the worker that is idle next.
+    async def localize(self, task: Task) -> Answer:
+        """Localize a picture on the worker that is idle next.
 
         Raises:
             WorkerLostError: where several workers, one after another, were lost with it.
@@ -210,30 +210,30 @@ def _work(pipe: Connection, bundles: Mapping[str, Path]) -> None:
     """What a worker does: answer tasks, one after another, until the server ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the server's
     warnings.simplefilter("always")
-    localisers = {name: Localiser(path, threads=1) for name, path in bundles.items()}
+    localizers = {name: Localizer(path, threads=1) for name, path in bundles.items()}
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         pipe.send({})
         while True:
             task = pipe.recv()
-            pipe.send(_answer(localisers[task.bundle], task))
+            pipe.send(_answer(localizers[task.bundle], task))
     sys.exit()
 
 
-def _answer(localiser: Localiser, task: Task) -> Answer:
+def _answer(localizer: Localizer, task: Task) -> Answer:
     image = decode_image(task.picture)
     if isinstance(image, str):
         return {"error": image}
     with warnings.catch_warnings(record=True) as told:
         try:
-            found = localiser.localise(image, task.intrinsics, task.is_distorted)
+            found = localizer.localize(image, task.intrinsics, task.is_distorted)
         except InputError as error:
             return {"error": str(error)}
-    answer = {"bundle": task.bundle, "scene": localiser.scene, **pose_of(found)}
+    answer = {"bundle": task.bundle, "scene": localizer.scene, **pose_of(found)}
     return answer | ({"warnings": [str(each.message) for each in told]} if told else {})
 
 
-def pose_of(found: Localisation) -> Answer:
-    """A localisation for JSON; null where nothing is known."""
+def pose_of(found: Localization) -> Answer:
+    """A localization for JSON; null where nothing is known."""
     covariance = None if found.covariance is None else found.covariance.tolist()
     return {
         "position_m": _finite(found.position_m.tolist()),

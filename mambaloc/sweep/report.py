@@ -111,7 +111,7 @@ def _with_maps(rows: Sequence[Row]) -> list[Section]:
     """The networks beside a map; nothing where none was built."""
     text = (
         "The map's pose where it is accepted, otherwise the network's. Means over seeds of the networks. A map has no "
-        "such seed; each picture was localised with one seed of RANSAC. Wrong: by more than 0.2 m or 5°. CPU time is "
+        "such seed; each picture was localized with one seed of RANSAC. Wrong: by more than 0.2 m or 5°. CPU time is "
         "what the map took on all cores. The map alone is among the references."
     )
     header = [*rows[0].labels, "seeds"]
@@ -179,7 +179,7 @@ def _reached(row: Row, reach_m: float | None) -> str:
 
 def _references(rows: Sequence[Row]) -> Section:
     """What needs no training, once for the same answer to the same frames."""
-    text = "What any localiser must beat; the nearest training pose is what no retrieval could."
+    text = "What any localizer must beat; the nearest training pose is what no retrieval could."
     found = dict.fromkeys(
         (row.data, str(row.train_frames), name.replace("_", " "), *(f"{medians[error]:.3f}" for error in ERRORS))
         for row in rows

@@ -98,13 +98,13 @@ class PlaneSweep:
         others = self.neighbours(row)
         if not others:
             return torch.full(self.images.shape[2:], torch.nan, device=self.device)
-        picture, *neighbours = self._normalised([row, *others])
+        picture, *neighbours = self._normalized([row, *others])
         costs = [self._cost(picture, row, image, other) for image, other in zip(neighbours, others, strict=True)]
         volume = best_half(torch.stack(costs))
         volume = aggregated(volume, self.settings.small_step, self.settings.large_step)
         return 1 / between_planes(volume, self._inverse)
 
-    def _normalised(self, rows: list[int]) -> Tensor:
+    def _normalized(self, rows: list[int]) -> Tensor:
         """Colours in deviations from the mean around each pixel, (R, 3, h, w)."""
         colors = torch.from_numpy(self.images[rows]).to(self.device, torch.float32)
         mean = self._around(colors)

@@ -61,7 +61,7 @@ def readings(network: PoseNetwork, image: Tensor, intrinsics: Tensor | None = No
     with torch.enable_grad(), _listening(network.backbone) as maps:
         prediction = network(image.detach().requires_grad_(), intrinsics)
         answers = (
-            network.head.position_scale.normalise(prediction.position_m),
+            network.head.position_scale.normalize(prediction.position_m),
             log_from_quaternion(prediction.quaternion),
         )
         position, orientation = (_reading(torch.linalg.vector_norm(answer, dim=-1), maps) for answer in answers)

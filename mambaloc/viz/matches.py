@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mambaloc.images import Image, read_image
 from mambaloc.mapping import PosedFrames
-from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import CameraPose, MapLocalizer, SparseMap
 from mambaloc.viz.png import write_png
 
 _MATCHED, _UNMATCHED, _LOST = "#7CFC00", "#dddddd", "#ff5a4d"
@@ -38,7 +38,7 @@ class Seen:
 
 
 def write_points(maps: dict[str, SparseMap], frames: PosedFrames, path: Path, title: str) -> None:
-    """Localise a few frames, evenly spread, in one map or another, and draw which of their keypoints matched.
+    """Localize a few frames, evenly spread, in one map or another, and draw which of their keypoints matched.
 
     Args:
         maps: by what to call each.
@@ -48,22 +48,22 @@ def write_points(maps: dict[str, SparseMap], frames: PosedFrames, path: Path, ti
     """
     rows = np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))
     images = [read_image(each) if isinstance(each := frames.images[row], Path) else each for row in rows]
-    localisers = {name: MapLocaliser(sparse_map) for name, sparse_map in maps.items()}
+    localizers = {name: MapLocalizer(sparse_map) for name, sparse_map in maps.items()}
     seen = {
-        name: [look(localiser, image, frames.intrinsics[row]) for image, row in zip(images, rows, strict=True)]
-        for name, localiser in localisers.items()
+        name: [look(localizer, image, frames.intrinsics[row]) for image, row in zip(images, rows, strict=True)]
+        for name, localizer in localizers.items()
     }
     draw_matches(seen, path, title)
 
 
-def look(localiser: MapLocaliser, image: Image, intrinsics: NDArray[np.float64]) -> Seen:
-    """Localise a picture, and keep which of its keypoints show a point of the map."""
-    features = localiser.features(image, intrinsics)
-    found = localiser.localise_features(features)
+def look(localizer: MapLocalizer, image: Image, intrinsics: NDArray[np.float64]) -> Seen:
+    """Localize a picture, and keep which of its keypoints show a point of the map."""
+    features = localizer.features(image, intrinsics)
+    found = localizer.localize_features(features)
     is_matched = np.zeros(len(features), bool)
     if np.isfinite(found.position_m).all():
         pose = CameraPose.from_quaternion(found.quaternion, found.position_m)
-        is_matched[localiser.matches(features, localiser.drift.to_adjusted(pose))[0]] = True
+        is_matched[localizer.matches(features, localizer.drift.to_adjusted(pose))[0]] = True
     scale = image.shape[1] / features.size[0]
     return Seen(image, (features.pixels + 0.5) * scale - 0.5, is_matched, found.is_accepted)
 

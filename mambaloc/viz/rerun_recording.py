@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from mambaloc.errors import InputError
 from mambaloc.files import whole_file, writing
 from mambaloc.images import CORNER_PX, Image
-from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.maps import SparseMap
 from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 from mambaloc.runtime.world import World
@@ -64,7 +64,7 @@ class RerunRecording:
     def add_frame(
         self,
         image: Image,
-        pose: Localisation,
+        pose: Localization,
         taken: float | np.datetime64,
         intrinsics: ArrayLike | None = None,
         truth: Pose | None = None,
@@ -141,7 +141,7 @@ class RerunRecording:
     def _scene_m(self, position_m: ArrayLike) -> Floats:
         return np.asarray(position_m, np.float64) - self._world.offset_m
 
-    def _log_radius(self, pose: Localisation) -> None:
+    def _log_radius(self, pose: Localization) -> None:
         """Nine of ten poses are inside: the covariance's ellipsoid, or a sphere."""
         import rerun as rr
 
@@ -207,7 +207,7 @@ def rerun_recording(path: Path, scene: str, world: World | None = None) -> Itera
         stream.disconnect()
 
 
-def _numbers(pose: Localisation, truth: Pose | None) -> dict[str, float]:
+def _numbers(pose: Localization, truth: Pose | None) -> dict[str, float]:
     """What is plotted: radii, and errors where the truth is known."""
     numbers = {
         "position_radius_m": pose.position_radius_m,

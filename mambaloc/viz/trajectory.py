@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from mambaloc.metrics import PoseErrorTable, summarise
+from mambaloc.metrics import PoseErrorTable, summarize
 from mambaloc.viz.png import write_png
 
 TRUE_COLOR, PREDICTED_COLOR = "#1a9850", "#d73027"
@@ -83,11 +83,11 @@ def box_around(*tables: PoseErrorTable) -> NDArray[np.floating]:
 
 def medians(table: PoseErrorTable) -> str:
     """Say a split's median errors."""
-    summary = summarise(table)
+    summary = summarize(table)
     return f"median {summary['position_error_m']:.3f} m, {summary['rotation_error_deg']:.2f}°"
 
 
 def means(table: PoseErrorTable) -> str:
     """Say a split's mean errors."""
-    summary = summarise(table)
+    summary = summarize(table)
     return f"mean {summary['position_error_mean_m']:.3f} m, {summary['rotation_error_mean_deg']:.2f}°"

@@ -17,10 +17,10 @@ from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.registry import licence_of_weights
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint
-from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.export.maps import check_scene
 from mambaloc.files import sha256, whole_folder
-from mambaloc.metrics import summarise
+from mambaloc.metrics import summarize
 from mambaloc.models import Checkpoint
 from mambaloc.models.registry import model_class
 from mambaloc.runtime.contract import POSE
@@ -154,7 +154,7 @@ def _result(measured: dict[str, Any]) -> Result:
 
 def _agree(folder: Path, measured: dict[str, Any], data: PoseDataModule, accelerator: str) -> None:
     """Refuse what does not find again what was measured."""
-    again = summarise(localise_test_frames(load_released(folder), data, accelerator))
+    again = summarize(localize_test_frames(load_released(folder), data, accelerator))
     before = measured["metrics"]
     for name in ("position_error_m", "rotation_error_deg"):
         if not abs(again[name] - before[name]) <= 1e-3 * max(1.0, before[name]):

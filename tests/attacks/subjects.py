@@ -23,7 +23,7 @@ from mambaloc.importing.importer import import_scene
 from mambaloc.models import Checkpoint
 from mambaloc.models.student import LitStudent
 from mambaloc.models.weights import read_checkpoint
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.trajectory import write_tum
 from mambaloc.sweep import Store, read_sweep, run_sweep, running
@@ -103,7 +103,7 @@ def export_converted(inputs, out):
 def check_export(out):
     path = out / "model.onnx"
     if path.exists():
-        Localiser(path, 1).localise(np.zeros((40, 50, 3), np.uint8))
+        Localizer(path, 1).localize(np.zeros((40, 50, 3), np.uint8))
     return path.exists()
 
 

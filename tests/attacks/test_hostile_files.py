@@ -31,7 +31,7 @@ from mambaloc.importing.registry import read_capture
 from mambaloc.models.weights import read_checkpoint
 from mambaloc.rendering import read_pose_table, shots_of_sequences, write_cambridge
 from mambaloc.rendering.trajectories import smooth_trajectory
-from mambaloc.runtime import Contract, Localiser
+from mambaloc.runtime import Contract, Localizer
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.sweep import Store, Trial, read_sweep
 from mambaloc.zoo.loading import load_released
@@ -323,6 +323,6 @@ def test_models(inputs, tmp_path):
     refusals = (RuntimeError("Load model failed:\nProtobuf parsing failed."), MemoryError(), ValueError("\n"))
     for refusal in refusals:  # as ONNX Runtime refuses a file; none that is damaged is handed to its parser here
         with mock.patch("onnxruntime.InferenceSession", side_effect=refusal), pytest.raises(InputError) as caught:
-            Localiser(model, 1)
+            Localizer(model, 1)
         assert "\n" not in str(caught.value)
         assert "ONNX Runtime cannot load it" in str(caught.value)

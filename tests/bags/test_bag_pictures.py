@@ -44,7 +44,7 @@ def swapped(rgb, alpha=False):
 
 @pytest.mark.parametrize("pad", [0, 5])
 @pytest.mark.parametrize("kind", KINDS)
-def test_colours_are_kept(record, rgb, kind, pad):
+def test_colors_are_kept(record, rgb, kind, pad):
     with_alpha = np.dstack((rgb, np.full(rgb.shape[:2], 7, np.uint8)))
     written = {
         "rgb8": rgb,

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from mambaloc.bags.reading import is_bag
 from mambaloc.bags.writing import TOPIC, covariance_of, moved, pose_bag
 from mambaloc.errors import InputError
-from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.maps.radii import covariance_radius
 
 POSITION, WXYZ = np.array([1.0, -2.0, 3.5]), np.array([0.5, -0.5, 0.5, 0.5])
@@ -45,7 +45,7 @@ def test_an_error_leaves_nothing_and_nothing_is_overwritten(tmp_path, name):
 
 def test_a_covariance_has_the_radii_that_it_is_made_of():
     """Nine of ten sampled errors are within the radii, whose formula is within 3 % of the exact one."""
-    covariance = covariance_of(Localisation(POSITION, WXYZ, 0.0, 0.3, 4.0))
+    covariance = covariance_of(Localization(POSITION, WXYZ, 0.0, 0.3, 4.0))
     assert covariance_radius(covariance[:3, :3]) == pytest.approx(0.3)
     assert np.degrees(covariance_radius(covariance[3:, 3:])) == pytest.approx(4.0)
     errors = np.random.default_rng(0).multivariate_normal(np.zeros(6), covariance, 20_000)
@@ -55,8 +55,8 @@ def test_a_covariance_has_the_radii_that_it_is_made_of():
 
 def test_the_maps_covariance_is_written_as_it_is_and_none_without_radii():
     told = np.diag([1.0, 2, 3, 4, 5, 6])
-    assert (covariance_of(Localisation(POSITION, WXYZ, 0.0, 0.3, 4.0, covariance=told)) == told).all()
-    assert covariance_of(Localisation(POSITION, WXYZ, 0.0)) is None
+    assert (covariance_of(Localization(POSITION, WXYZ, 0.0, 0.3, 4.0, covariance=told)) == told).all()
+    assert covariance_of(Localization(POSITION, WXYZ, 0.0)) is None
 
 
 def test_a_body_beside_the_camera_has_the_covariance_of_sampled_poses():

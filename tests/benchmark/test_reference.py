@@ -37,7 +37,7 @@ def test_published_transposenet_is_the_same_function(backbone, gis):
     system = create_model("mambaloc", backbone=backbone, gis=gis, image_size=64, **SMALL).eval()
     published = PublishedTransPoseNet(system).eval()
     image = torch.rand(2, 3, 64, 64)
-    same(system(image), published(system.network.backbone.normalised(image).contiguous()))
+    same(system(image), published(system.network.backbone.normalized(image).contiguous()))
 
 
 @pytest.mark.parametrize("gis", ["none", "gis"])
@@ -45,7 +45,7 @@ def test_published_atloc_is_the_same_function(gis):
     torch.manual_seed(0)
     system = create_model("atloc", backbone="resnet10t", width=32, gis=gis, image_size=64).eval()
     image = torch.rand(2, 3, 64, 64)
-    same(system(image), PublishedAtLoc(system).eval()(system.network.backbone.normalised(image).contiguous()))
+    same(system(image), PublishedAtLoc(system).eval()(system.network.backbone.normalized(image).contiguous()))
 
 
 def test_published_dropout_is_ours():

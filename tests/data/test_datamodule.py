@@ -252,7 +252,7 @@ def gradient_batch() -> PoseBatch:
 
 @pytest.mark.parametrize("trainer", [None, SimpleNamespace(training=False, current_epoch=2)])
 @pytest.mark.parametrize(("image_size", "crop"), [(12, (12, 12)), ((10, 20), (10, 20)), (16, (16, 16))])
-def test_outside_training_a_batch_is_cropped_in_the_centre(make, trainer, image_size, crop):
+def test_outside_training_a_batch_is_cropped_in_the_center(make, trainer, image_size, crop):
     module, batch = make(image_size=image_size), gradient_batch()
     module.trainer = trainer
     out = module.on_after_batch_transfer(batch, 0)

@@ -14,7 +14,7 @@ from mambaloc.errors import InputError, InputWarning
 from mambaloc.rendering import default_intrinsics
 
 
-def test_7scenes_has_one_colour_camera(write_tiny_scene):
+def test_7scenes_has_one_color_camera(write_tiny_scene):
     """525 px at a width of 640, the centre in the middle of the picture: here 32x24."""
     folder = write_tiny_scene({1: 3}).folder
     frames = seven_scenes.read_split(folder, "train", BadFrames())

@@ -45,13 +45,13 @@ def test_a_hole_turns_with_its_view_and_borders_stay_black():
         intrinsics=torch.from_numpy(K).float().expand(2, -1, -1), holes=holes,
     )  # fmt: skip
     still = RandomRotation(SIZE, 20.0)
-    colours = Jitter(0, 0, 0).matrices(batch.image, torch.full((2, 3), 0.5))
+    colors = Jitter(0, 0, 0).matrices(batch.image, torch.full((2, 3), 0.5))
     middle = torch.full((2, 4), 0.5)
-    out = still(batch, colours, middle)
+    out = still(batch, colors, middle)
     assert torch.equal(out.holes, holes)
     expected = torch.where(holes[1], 100 / 255, 200 / 255)
     torch.testing.assert_close(out.image[1, 0], expected, rtol=0, atol=0.2 / 255 + 100 / 255 * 1e-3)
-    turned = still(batch, colours, middle + torch.tensor([0, 0.45, 0, 0]))  # by 18 degrees about y, to the right
+    turned = still(batch, colors, middle + torch.tensor([0, 0.45, 0, 0]))  # by 18 degrees about y, to the right
     assert turned.holes[1, :, 4:9].all()
     assert not turned.holes[:, :, -1].any()
     assert (turned.image[:, :, :, -1] == 0).all()
@@ -61,8 +61,8 @@ def test_a_crop_takes_its_part_of_a_hole():
     holes = torch.zeros(2, *SIZE, dtype=torch.bool)
     holes[1, :6] = True
     batch = PoseBatch(greys(100, 200), torch.zeros(2, 3), UPRIGHT.expand(2, -1), torch.arange(2), holes=holes)
-    colours = Jitter(0, 0, 0).matrices(batch.image, torch.full((2, 3), 0.5))
-    out = RandomCrop((6, 8))(batch, colours, torch.tensor([[0.0, 0.0], [0.5, 0.0]]))
+    colors = Jitter(0, 0, 0).matrices(batch.image, torch.full((2, 3), 0.5))
+    out = RandomCrop((6, 8))(batch, colors, torch.tensor([[0.0, 0.0], [0.5, 0.0]]))
     assert out.holes[1].sum(dim=0).tolist() == [3] * 8  # rows 3 to 8 of the view
     torch.testing.assert_close(out.image[1, 0, :, 0] * 255, torch.tensor([100.0] * 3 + [200.0] * 3))
 

@@ -134,7 +134,7 @@ def test_turns_and_zooms_fill_their_ranges(rotation_deg, zoom):
     torch.testing.assert_close(out.quaternion, canonical(out.quaternion))
 
 
-def test_black_stays_black_whatever_the_colours(rendered):
+def test_black_stays_black_whatever_the_colors(rendered):
     batch = rendered[0]
     view, chances = RandomRotation(CROP, 15.0), draw_uniforms(5, 0, COUNT, 7)
     color = Jitter(0.5, 0.9, 0.5).matrices(batch.image, chances[:, 4:])

@@ -1,4 +1,4 @@
-// node map_replay.mjs MODULES WEB MAP PICTURE...: where the page's modules localise pictures in a map, as JSON; and on
+// node map_replay.mjs MODULES WEB MAP PICTURE...: where the page's modules localize pictures in a map, as JSON; and on
 // the error stream the median CPU time of a picture, decoding left out, once the first ones have warmed the compiler up.
 import { readFile } from "node:fs/promises";
 import { createRequire } from "node:module";
@@ -7,14 +7,14 @@ import { pathToFileURL } from "node:url";
 
 const [modules, web, map, ...pictures] = process.argv.slice(2);
 const { PNG } = createRequire(join(modules, "replay.cjs"))("pngjs");
-const { MapLocaliser } = await import(pathToFileURL(join(web, "map_localiser.js")));
+const { MapLocalizer } = await import(pathToFileURL(join(web, "map_localizer.js")));
 const { readMap } = await import(pathToFileURL(join(web, "sparse_map.js")));
-const localiser = new MapLocaliser(readMap(new Uint8Array(await readFile(map))));
+const localizer = new MapLocalizer(readMap(new Uint8Array(await readFile(map))));
 const [found, cpu_ms] = [[], []];
 for (const picture of pictures) {
   const { data, width, height } = PNG.sync.read(await readFile(picture));
   const start = process.cpuUsage();
-  found.push(localiser.localise({ data, width, height }));
+  found.push(localizer.localize({ data, width, height }));
   const { user, system } = process.cpuUsage(start);
   cpu_ms.push((user + system) / 1000);
 }

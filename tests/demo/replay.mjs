@@ -8,13 +8,13 @@ const [modules, web, bundle, model] = process.argv.slice(2);
 const require = createRequire(join(modules, "replay.cjs"));
 const ort = require("onnxruntime-node");
 const { PNG } = require("pngjs");
-const { Localiser } = await import(pathToFileURL(join(web, "localiser.js")));
+const { Localizer } = await import(pathToFileURL(join(web, "localizer.js")));
 
 const contract = JSON.parse(await readFile(join(bundle, "contract.json"), "utf8"));
-const localiser = await Localiser.create(ort, await readFile(join(bundle, model)), contract);
+const localizer = await Localizer.create(ort, await readFile(join(bundle, model)), contract);
 const found = [];
 for (const { file, intrinsics } of contract.frames) {
   const { data, width, height } = PNG.sync.read(await readFile(join(bundle, file)));
-  found.push(await localiser.localise({ data, width, height, channels: 4 }, intrinsics));
+  found.push(await localizer.localize({ data, width, height, channels: 4 }, intrinsics));
 }
 console.log(JSON.stringify(found));

@@ -10,7 +10,7 @@ from importlib import resources
 
 import numpy as np
 import pytest
-from films import COLOURS, coloured_film, patches
+from films import COLORS, colored_film, patches
 
 from mambaloc.runtime.sources import frames_of
 
@@ -27,8 +27,8 @@ FIRST_FRAME = """async () => {
 
 
 @pytest.mark.parametrize("standard", ["bt601", "bt709"])
-def test_the_browser_sees_the_colours_that_python_sees(browser, served, tmp_path, standard):
-    film = coloured_film(tmp_path / "film.webm", standard)
+def test_the_browser_sees_the_colors_that_python_sees(browser, served, tmp_path, standard):
+    film = colored_film(tmp_path / "film.webm", standard)
     shutil.copy(WEB / "sources.js", tmp_path)
     (tmp_path / "index.html").write_text('<!doctype html><video src="film.webm" muted autoplay></video>')
     with served(tmp_path) as server:
@@ -39,5 +39,5 @@ def test_the_browser_sees_the_colours_that_python_sees(browser, served, tmp_path
     in_browser = patches(np.array(rgba, np.uint8).reshape(height, width, 4)[..., :3])
     in_python = patches(next(frames_of(film)[0]).image)
     worst = np.abs(in_browser - in_python).max()
-    print(f"{standard}: {worst:.0f} levels apart, browser {np.abs(in_browser - COLOURS).max():.0f} from its colours")
+    print(f"{standard}: {worst:.0f} levels apart, browser {np.abs(in_browser - COLORS).max():.0f} from its colours")
     assert worst <= 3

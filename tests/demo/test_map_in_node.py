@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mambaloc.images import read_image
-from mambaloc.runtime.maps import MapLocaliser, SparseMap
+from mambaloc.runtime.maps import MapLocalizer, SparseMap
 from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, pose_covariance, refine_pose
 from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, MOST_DEVIATION, Evidence, is_another_focal_length
 from mambaloc.runtime.maps.drift import Drift, fit_drift
@@ -225,9 +225,9 @@ def test_poses_in_a_map_are_pythons(den, map_of_den, is_adjusted, modules, tmp_p
     cv2.imwrite(str(large), cv2.resize(cv2.imread(str(frames[0])), (640, 480), interpolation=cv2.INTER_CUBIC))
     cv2.imwrite(str(black), np.zeros((120, 160, 3), np.uint8))
     answer = json.loads(node(HERE / "map_replay.mjs", modules, WEB, map_of_den, *frames, large, black))
-    localiser = MapLocaliser(SparseMap.load(map_of_den))
+    localizer = MapLocalizer(SparseMap.load(map_of_den))
     for path, found in zip([*frames, large], answer[:-1], strict=True):
-        expected = localiser.localise(read_image(path))
+        expected = localizer.localize(read_image(path))
         assert found["isAccepted"] is expected.is_accepted is True
         assert 1000 * np.linalg.norm(np.array(found["position_m"]) - expected.position_m) < 10
         assert rotation_error_deg(np.array(found["quaternion_wxyz"]), expected.quaternion) < 0.3
@@ -239,4 +239,4 @@ def test_poses_in_a_map_are_pythons(den, map_of_den, is_adjusted, modules, tmp_p
         offs = np.array([match["off"] for match in found["matches"]])
         assert (offs <= 1).sum() == found["inliers"]
     assert answer[-1] is None
-    assert not localiser.localise(read_image(black)).is_accepted
+    assert not localizer.localize(read_image(black)).is_accepted

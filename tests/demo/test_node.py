@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mambaloc.runtime import Contract, Localiser, Preprocessing
+from mambaloc.runtime import Contract, Localizer, Preprocessing
 from mambaloc.runtime.rotations import rotation_error_deg
 
 pytestmark = pytest.mark.slow
@@ -25,11 +25,11 @@ WEB = resources.files("mambaloc.demo") / "web"
 def test_poses_in_node_are_pythons(which, model, modules, request, node):
     folder = request.getfixturevalue(which)
     found = json.loads(node(HERE / "replay.mjs", modules, WEB, folder, model))
-    localiser = Localiser(folder / model)
+    localizer = Localizer(folder / model)
     frames = json.loads((folder / "contract.json").read_text())["frames"]
     assert len(found) == len(frames) == 5
     for pose, frame in zip(found, frames, strict=True):
-        expected = localiser.localise(folder / frame["file"])
+        expected = localizer.localize(folder / frame["file"])
         assert 1000 * np.linalg.norm(np.array(pose["position_m"]) - expected.position_m) < 1
         assert rotation_error_deg(np.array(pose["quaternion_wxyz"]), expected.quaternion) < 0.1
 
@@ -38,11 +38,11 @@ def test_poses_in_node_are_pythons(which, model, modules, request, node):
 def test_poses_through_another_lens_in_node_are_pythons(kind, model, bundles_for_lenses, modules, node):
     folder = bundles_for_lenses / kind
     found = json.loads(node(HERE / "replay.mjs", modules, WEB, folder, model))
-    localiser = Localiser(folder / model)
+    localizer = Localizer(folder / model)
     frames = json.loads((folder / "contract.json").read_text())["frames"]
     assert len(found) == len(frames) == 6
     for pose, frame in zip(found, frames, strict=True):
-        expected = localiser.localise(folder / frame["file"], frame["intrinsics"])
+        expected = localizer.localize(folder / frame["file"], frame["intrinsics"])
         assert 1000 * np.linalg.norm(np.array(pose["position_m"]) - expected.position_m) < 1
         assert rotation_error_deg(np.array(pose["quaternion_wxyz"]), expected.quaternion) < 0.05
 
@@ -137,33 +137,33 @@ def test_the_page_on_pcs_in_python(pictures, precision, tmp_path):
     model = f"model.{precision}onnx"
     if not (pictures / model).is_file():
         pytest.skip("an untrained DenseLoc is not exported in float16")
-    (tmp_path / "localise.py").write_text(code_of("pc.md", "python", "class Localiser"))
-    command = [sys.executable, tmp_path / "localise.py", pictures, model]
+    (tmp_path / "localize.py").write_text(code_of("pc.md", "python", "class Localizer"))
+    command = [sys.executable, tmp_path / "localize.py", pictures, model]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout == "the port is right\n", done.stderr
 
 
 def test_the_page_on_pcs_in_node(pictures, modules, tmp_path, node):
     (tmp_path / "node_modules").symlink_to(modules)
-    (tmp_path / "localise.mjs").write_text(code_of("pc.md", "js", "localise.mjs"))
-    assert node(tmp_path / "localise.mjs", pictures, cwd=tmp_path) == "the port is right\n"
+    (tmp_path / "localize.mjs").write_text(code_of("pc.md", "js", "localize.mjs"))
+    assert node(tmp_path / "localize.mjs", pictures, cwd=tmp_path) == "the port is right\n"
 
 
 def test_the_page_on_the_web(pictures, modules, tmp_path, node):
     """Its class and its check, with the build for Node in place of the browser's."""
     (tmp_path / "node_modules").symlink_to(modules)
-    code = code_of("web.md", "js", "// localiser.js").replace("./ort/ort.wasm.min.mjs", "onnxruntime-web")
+    code = code_of("web.md", "js", "// localizer.js").replace("./ort/ort.wasm.min.mjs", "onnxruntime-web")
     code = code.replace("ort.env.wasm.wasmPaths = new URL('./ort/', import.meta.url).href;", "")
-    (tmp_path / "localiser.mjs").write_text(code)
+    (tmp_path / "localizer.mjs").write_text(code)
     (tmp_path / "check.mjs").write_text(
         """
         import { readFile } from "node:fs/promises";
         import { PNG } from "pngjs";
-        import { Localiser, checkPort } from "./localiser.mjs";
+        import { Localizer, checkPort } from "./localizer.mjs";
         const [bundle] = process.argv.slice(2);
         const contract = JSON.parse(await readFile(`${bundle}/contract.json`, "utf8"));
-        const localiser = await Localiser.create(new Uint8Array(await readFile(`${bundle}/model.onnx`)), contract);
-        await checkPort(localiser, "model.onnx", async (file) => PNG.sync.read(await readFile(`${bundle}/${file}`)));
+        const localizer = await Localizer.create(new Uint8Array(await readFile(`${bundle}/model.onnx`)), contract);
+        await checkPort(localizer, "model.onnx", async (file) => PNG.sync.read(await readFile(`${bundle}/${file}`)));
         console.log("the port is right");
         """
     )

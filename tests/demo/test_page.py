@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mambaloc.errors import InputWarning
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 from mambaloc.runtime.rotations import rotation_error_deg
 
 pytestmark = pytest.mark.slow
@@ -63,7 +63,7 @@ def load(browser):
 CHOOSE = """(source) => {
     for (const name of [source === "photo" ? "frames" : "photo", source])
         document.querySelector(`[name=source][value=${name}]`).click();
-    window.localisedBefore = Number(document.querySelector("#pose").dataset.frame ?? 0);
+    window.localizedBefore = Number(document.querySelector("#pose").dataset.frame ?? 0);
 }"""
 
 
@@ -86,8 +86,8 @@ def opened(load, address):
 
 
 def pose_of(page, count=1):
-    """What the page says after so many localisations since it was opened."""
-    count += page.evaluate("window.localisedBefore")
+    """What the page says after so many localizations since it was opened."""
+    count += page.evaluate("window.localizedBefore")
     page.wait_for_selector(f'#pose[data-frame="{count}"]', timeout=30_000)
     read = [json.loads(page.get_attribute("#pose", f"data-{name}")) for name in ("position-m", "quaternion-wxyz")]
     return tuple(np.array(each) for each in read)
@@ -100,11 +100,11 @@ def check(found, expected, mm=1.0, deg=0.1):
 
 
 def test_poses_of_the_frames_are_pythons(opened, bundle):
-    page, localiser = opened("frames"), Localiser(bundle)
+    page, localizer = opened("frames"), Localizer(bundle)
     frames = json.loads((bundle / "contract.json").read_text())["frames"]
     for count, frame in enumerate(frames, start=1):
         page.click(f'[data-frame-file="{frame["file"]}"]')
-        check(pose_of(page, count), localiser.localise(bundle / frame["file"]))
+        check(pose_of(page, count), localizer.localize(bundle / frame["file"]))
     assert page.get_attribute("body", "data-backend") == "wasm"
     assert page.evaluate(expression="crossOriginIsolated") is True
 
@@ -112,16 +112,16 @@ def test_poses_of_the_frames_are_pythons(opened, bundle):
 def test_a_bundle_that_takes_pictures_as_they_are(opened, raw_bundle, raw_address):
     page = opened("frames", raw_address)
     page.click('[data-frame-file="frames/1.png"]')
-    check(pose_of(page), Localiser(raw_bundle).localise(raw_bundle / "frames/1.png"))
+    check(pose_of(page), Localizer(raw_bundle).localize(raw_bundle / "frames/1.png"))
 
 
 def test_poses_through_another_lens_are_pythons(opened, bundles_for_lenses, lens_address):
     folder = bundles_for_lenses / "tensors"
-    page, localiser = opened("frames", lens_address), Localiser(folder)
+    page, localizer = opened("frames", lens_address), Localizer(folder)
     frames = json.loads((folder / "contract.json").read_text())["frames"]
     for count, frame in enumerate(frames, start=1):
         page.click(f'[data-frame-file="{frame["file"]}"]')
-        check(pose_of(page, count), localiser.localise(folder / frame["file"], frame["intrinsics"]), deg=0.05)
+        check(pose_of(page, count), localizer.localize(folder / frame["file"], frame["intrinsics"]), deg=0.05)
     assert page.is_hidden("#lens")  # the contract says what took them
 
 
@@ -129,26 +129,26 @@ def test_the_page_is_told_what_lens_took_a_photo(opened, bundles_for_lenses, len
     folder, path = bundles_for_lenses / "tensors", tmp_path / "upright.png"
     upright = cv2.imread(str(folder / "frames/2.png"))[:, 20:110]
     cv2.imwrite(str(path), upright)
-    page, localiser = opened("photo", lens_address), Localiser(folder)
+    page, localizer = opened("photo", lens_address), Localizer(folder)
     page.fill("#focal", "")
     page.set_input_files("#photo", path)
     page.wait_for_selector("body[data-state=error]", timeout=30_000)
     assert "or say what lens took it" in page.inner_text("#error")
     page.fill("#focal", "30")
-    page.press("#focal", "Enter")  # and the photo is localised again
+    page.press("#focal", "Enter")  # and the photo is localized again
     focal_px = 30 * np.hypot(90, 120) / np.hypot(36, 24)
     intrinsics = [[focal_px, 0, 44.5], [0, focal_px, 59.5], [0, 0, 1]]
-    check(pose_of(page), localiser.localise(path, intrinsics), deg=0.05)
+    check(pose_of(page), localizer.localize(path, intrinsics), deg=0.05)
     assert page.is_hidden("#error")
 
 
 def test_how_sure_a_model_is(opened, raw_bundle, raw_address, tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "noise.png"), noise)
-    localiser, page = Localiser(raw_bundle), opened("photo", raw_address)
+    localizer, page = Localizer(raw_bundle), opened("photo", raw_address)
     for count, path in enumerate((raw_bundle / "frames/3.png", tmp_path / "noise.png"), start=1):
         page.set_input_files("#photo", path)
-        check(pose_of(page, count), found := localiser.localise(path))
+        check(pose_of(page, count), found := localizer.localize(path))
         radii = [page.text_content(f'[data-show="radius-{of}"]') for of in ("position", "rotation")]
         assert radii == [f"±{found.position_radius_m:.2f} m", f"±{found.rotation_radius_deg:.1f}°"]
         assert page.get_attribute("#uncertainty", "data-within") == str(not found.is_unfamiliar).lower()
@@ -177,12 +177,12 @@ DRAWN = """() => {
 
 def test_the_map_answers_as_in_python(opened, map_bundle, map_address):
     """Python's test vectors, the runtime without torch, and the page find one pose."""
-    page, localiser = opened("frames", map_address), Localiser(map_bundle)
+    page, localizer = opened("frames", map_address), Localizer(map_bundle)
     frames = json.loads((map_bundle / "contract.json").read_text())["frames"]
     for count, frame in enumerate(frames, start=1):
         page.click(f'[data-frame-file="{frame["file"]}"]')
         found = pose_of(page, count)
-        expected = localiser.localise(map_bundle / frame["file"], frame["intrinsics"])
+        expected = localizer.localize(map_bundle / frame["file"], frame["intrinsics"])
         assert expected.source == page.get_attribute("#pose", "data-answer") == page.inner_text("[data-show=answer]")
         assert expected.source == "map"
         check(found, expected, mm=10.0, deg=0.3)
@@ -204,17 +204,17 @@ def test_the_network_answers_where_the_map_does_not(opened, map_bundle, map_addr
     noise = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "noise.png"), noise)
     cv2.imwrite(str(tmp_path / "wide.png"), cv2.imread(str(map_bundle / "frames/1.png"))[:90])  # by an unknown camera
-    page, localiser = opened("photo", map_address), Localiser(map_bundle)
+    page, localizer = opened("photo", map_address), Localizer(map_bundle)
     for count, name in enumerate(("noise.png", "wide.png"), start=1):
         page.set_input_files("#photo", tmp_path / name)
         with warnings.catch_warnings(action="ignore", category=InputWarning):
-            expected = localiser.localise(tmp_path / name)
+            expected = localizer.localize(tmp_path / name)
         check(pose_of(page, count), expected)
         assert expected.source == page.get_attribute("#pose", "data-answer") == "network"
         assert page.evaluate(DRAWN) == 0
 
 
-def test_the_film_of_the_maps_room_is_localised_to_centimetres(opened, map_address):
+def test_the_film_of_the_maps_room_is_localized_to_centimetres(opened, map_address):
     page = opened("film", map_address)
     page.wait_for_selector("#pose[data-film-frame]", timeout=30_000)
     for _ in range(5):
@@ -234,7 +234,7 @@ def test_a_bundle_without_a_map_says_nothing_of_one(opened):
 
 
 @pytest.mark.parametrize("kind", ["colour", "grey", "turned"])
-def test_photos_are_localised(opened, bundle, tmp_path, kind):
+def test_photos_are_localized(opened, bundle, tmp_path, kind):
     page = opened("photo")
     picture = cv2.imread(str(bundle / "frames/3.png"))
     path = tmp_path / "photo.png"
@@ -248,14 +248,14 @@ def test_photos_are_localised(opened, bundle, tmp_path, kind):
         cv2.imwrite(str(path), picture[..., 1] if kind == "grey" else picture)
     page.set_input_files("#photo", path)
     lossy = {"mm": 10.0, "deg": 0.5} if kind == "turned" else {}  # no two decoders agree on a JPEG
-    check(pose_of(page), Localiser(bundle).localise(path), **lossy)
+    check(pose_of(page), Localizer(bundle).localize(path), **lossy)
 
 
 SAID = "() => { const said = document.querySelector('#pose').dataset; return [said.filmFrame, said.positionM] }"
 
 
 def test_the_film_runs_beside_its_true_poses(opened, bundle, film):
-    page, localiser = opened("film"), Localiser(bundle)
+    page, localizer = opened("film"), Localizer(bundle)
     capture = cv2.VideoCapture(str(film / "film.webm"))
     pictures = [picture for read, picture in iter(capture.read, (False, None)) if read]
     found, deadline_s = {}, time.monotonic() + 30
@@ -267,14 +267,14 @@ def test_the_film_runs_beside_its_true_poses(opened, bundle, film):
     assert len(found) > 3
     near = {}
     for shift in (-2, 0, 2):
-        expected = {n: localiser.localise(pictures[n + shift][..., ::-1].copy()).position_m for n in found}
+        expected = {n: localizer.localize(pictures[n + shift][..., ::-1].copy()).position_m for n in found}
         near[shift] = np.median([np.linalg.norm(found[n] - expected[n]) for n in found])
     assert near[0] < 0.03  # decoders differ by centimetres
     assert near[0] < min(near[-2], near[2])  # and the number is that of the picture
     assert page.inner_text("[data-show=error-position]").endswith(" m")
 
 
-def test_a_camera_is_localised(opened):
+def test_a_camera_is_localized(opened):
     page = opened("camera")
     page.wait_for_selector("body[data-state=running]", timeout=30_000)
     assert page.get_attribute("#pose", "data-source") == "camera"
@@ -289,7 +289,7 @@ def test_a_camera_is_localised(opened):
         ((120, 160, 4), "has transparent parts"),
     ],
 )
-def test_a_picture_that_cannot_be_localised_is_one_clear_line(opened, tmp_path, shape, message):
+def test_a_picture_that_cannot_be_localized_is_one_clear_line(opened, tmp_path, shape, message):
     page, path = opened("photo"), tmp_path / "photo.png"
     path.write_bytes(b"noise" if shape is None else cv2.imencode(".png", np.zeros(shape, np.uint8))[1].tobytes())
     page.set_input_files("#photo", path)
@@ -302,7 +302,7 @@ def test_a_picture_larger_than_a_phones_canvas(opened, bundle, tmp_path):
     cv2.imwrite(str(path), cv2.resize(cv2.imread(str(bundle / "frames/3.png")), (5712, 4284)))
     page = opened("photo")
     page.set_input_files("#photo", path)
-    check(pose_of(page), Localiser(bundle).localise(path))
+    check(pose_of(page), Localizer(bundle).localize(path))
     assert page.evaluate("() => document.querySelector('#still').width") == 1024
 
 

@@ -11,9 +11,9 @@ import torch
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint
-from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.evaluation.trained import load_trained
-from mambaloc.metrics import summarise
+from mambaloc.metrics import summarize
 from mambaloc.models import Checkpoint, checkpoint
 
 TOOL = Path(__file__).parents[2] / "tools/evaluate.py"
@@ -53,7 +53,7 @@ def test_the_tool_reads_its_checkpoint_once(trained, reads, tmp_path, monkeypatc
 def test_errors_are_those_of_lightnings_own_test(trained):
     best = Checkpoint.read(trained / "checkpoints/best.ckpt")
     system, data = best.system(), best.data()
-    table = localise_test_frames(system.train(), data, "cpu")
+    table = localize_test_frames(system.train(), data, "cpu")
     assert not system.training
     quiet = {
         "logger": False,
@@ -62,7 +62,7 @@ def test_errors_are_those_of_lightnings_own_test(trained):
         "enable_model_summary": False,
     }
     (expected,) = L.Trainer(accelerator="cpu", **quiet).test(best.system(), datamodule=best.data(), verbose=False)
-    assert {f"test/{name}": value for name, value in summarise(table).items()} == pytest.approx(expected, rel=1e-6)
+    assert {f"test/{name}": value for name, value in summarize(table).items()} == pytest.approx(expected, rel=1e-6)
     assert table.index.tolist() == list(range(8))
 
 

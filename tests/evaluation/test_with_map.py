@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from mambaloc.errors import InputWarning
 from mambaloc.evaluation import evaluate_checkpoint, measure_map, measure_map_of_run, print_table
 from mambaloc.models import Checkpoint
-from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import CameraPose, MapLocalizer, SparseMap
 from mambaloc.uncertainty import Uncertainty
 
 TOOL = Path(__file__).parents[2] / "tools/evaluate.py"
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 def unsure(trained_with_map, tmp_path_factory):
     """The run's map, which now accepts about half of the test frames."""
     path = trained_with_map / "map/map.safetensors"
-    found = [localisation for _, localisation in in_map(SparseMap.load(path), frames_of(trained_with_map))]
+    found = [localization for _, localization in in_map(SparseMap.load(path), frames_of(trained_with_map))]
     least = int(np.median([each.inliers for each in found])) + 1
     out = tmp_path_factory.mktemp("unsure") / "map.safetensors"
     replace(SparseMap.load(path), least_inliers=least).save(out)
@@ -56,9 +56,9 @@ def frames_of(run):
 
 
 def in_map(sparse_map, frames, priors=None):
-    localiser = MapLocaliser(sparse_map)
+    localizer = MapLocalizer(sparse_map)
     for row, (picture, intrinsics, pose) in enumerate(frames):
-        yield pose, localiser.localise(picture, intrinsics, priors[row] if priors else None)
+        yield pose, localizer.localize(picture, intrinsics, priors[row] if priors else None)
 
 
 def rows_of(path):
@@ -200,9 +200,9 @@ def test_frames_without_a_pose_are_null_in_json(trained_with_map, tmp_path, monk
     checkpoint = Checkpoint.read(trained_with_map / "checkpoints/last.ckpt")
     path = trained_with_map / "map/map.safetensors"
     black, intrinsics = np.zeros((120, 160, 3), np.uint8), SparseMap.load(path).intrinsics
-    lost = MapLocaliser(SparseMap.load(path)).localise(black, intrinsics)
+    lost = MapLocalizer(SparseMap.load(path)).localize(black, intrinsics)
     assert np.isnan(lost.position_m).all()
-    monkeypatch.setattr(MapLocaliser, "localise", lambda self, *_: lost)
+    monkeypatch.setattr(MapLocalizer, "localize", lambda self, *_: lost)
     result = evaluate_checkpoint(checkpoint, tmp_path, accelerator="cpu", beside=measure_map(path, checkpoint.data()))
     read = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)
     assert read["map"]["metrics"]["position_error_m"] is None

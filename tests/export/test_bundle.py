@@ -21,11 +21,11 @@ from mambaloc.export.maps import check_scene
 from mambaloc.export.precision import half_precision
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.models.student import LitStudent
-from mambaloc.runtime import Localiser, Preprocessing, localisation
+from mambaloc.runtime import Localizer, Preprocessing, localization
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.maps import SparseMap, absolute_pose, acceptance, drift, features, lens, sparse_map, viewpoints
-from mambaloc.runtime.maps import localiser as maps_localiser
-from mambaloc.runtime.maps.localiser import near_px
+from mambaloc.runtime.maps import localizer as maps_localizer
+from mambaloc.runtime.maps.localizer import near_px
 
 pytestmark = pytest.mark.usefixtures("converted_once")
 
@@ -79,7 +79,7 @@ def test_a_bundle_tells_an_app_what_it_needs(bundle):
     assert (tensor.name, tensor.type) == (contract["input"]["name"], "tensor(uint8)" if raw else "tensor(float)")
     assert [o.name for o in session.get_outputs()] == list(contract["outputs"])
     assert len(contract["frames"]) == 5
-    assert Localiser(folder).contract.scene == "7scenes/den"
+    assert Localizer(folder).contract.scene == "7scenes/den"
     assert "Conv" in (folder / "required_operators_and_types.config").read_text()
     assert (folder / "model.fp16.onnx").stat().st_size < 0.6 * (folder / "model.onnx").stat().st_size
     assert "versions: torch 2" in (folder / "README.md").read_text()
@@ -138,7 +138,7 @@ def test_a_map_that_finds_other_poses_deviates(off_m, is_within, mapped):
     path = mapped / "contract.json"
     contract = json.loads(path.read_text())
     contract["frames"][3]["map"]["position_m"][0] += off_m
-    contract["frames"][1]["map"] = None  # of a frame that was not localised nothing is asked
+    contract["frames"][1]["map"] = None  # of a frame that was not localized nothing is asked
     path.write_text(json.dumps(contract))
     deviation = verify_bundle(mapped)[-1]
     assert (deviation.file, deviation.within) == ("map.safetensors", is_within)
@@ -171,7 +171,7 @@ def test_a_bad_description_of_a_map_is_refused(mapped):
 
 def test_a_map_of_another_scene_is_refused(student, map_of_den, scenes, tmp_path):
     other = PoseDataModule("7scenes", str(scenes), "heads", image_size=(32, 40), short_side=36)
-    with pytest.raises(InputError, match=r"is a map of 'den', which localises 0 of 8 .* of heads\. .*--no-map"):
+    with pytest.raises(InputError, match=r"is a map of 'den', which localizes 0 of 8 .* of heads\. .*--no-map"):
         write_bundle(student, other, tmp_path / "bundle", sparse_map=map_of_den)
     assert not list(tmp_path.iterdir())
 
@@ -183,7 +183,7 @@ def test_a_map_in_another_frame_is_refused(turn_rad, map_of_den, data):
     moved[:3, :3], moved[0, 3] = cv2.Rodrigues(np.array([0, 0, turn_rad]))[0], 0.0 if turn_rad else 0.4
     points_m = (sparse_map.points_m @ moved[:3, :3].T + moved[:3, 3]).astype(np.float32)
     check_scene(map_of_den, sparse_map, data)
-    with pytest.raises(InputError, match="localises 0 of 8"):
+    with pytest.raises(InputError, match="localizes 0 of 8"):
         check_scene(map_of_den, replace(sparse_map, points_m=points_m, key_poses=moved @ sparse_map.key_poses), data)
 
 
@@ -207,19 +207,19 @@ def test_native_apps_decide_as_python_does():
     written = {float(number) for number in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?", header)}
     numbers = {
         *(
-            maps_localiser._AT_ONCE,
-            maps_localiser._RATIO,
-            maps_localiser._GUIDED_RATIO,
-            maps_localiser._GUIDED_FARTHEST,
+            maps_localizer._AT_ONCE,
+            maps_localizer._RATIO,
+            maps_localizer._GUIDED_RATIO,
+            maps_localizer._GUIDED_FARTHEST,
         ),
         *(
-            maps_localiser._NEAREST,
-            *maps_localiser._WINDOWS,
-            maps_localiser._LEAST_SHARE,
-            maps_localiser._PRIOR_WINDOW,
-            maps_localiser._SHARED,
+            maps_localizer._NEAREST,
+            *maps_localizer._WINDOWS,
+            maps_localizer._LEAST_SHARE,
+            maps_localizer._PRIOR_WINDOW,
+            maps_localizer._SHARED,
         ),
-        *(acceptance._CELLS, acceptance.LEAST_PROBABILITY, acceptance.MOST_DEVIATION, localisation._UNSTATED),
+        *(acceptance._CELLS, acceptance.LEAST_PROBABILITY, acceptance.MOST_DEVIATION, localization._UNSTATED),
         *map(abs, (acceptance._CONSTANT, acceptance._PER_CELLS, acceptance._PER_DEVIATION, acceptance._PER_TURN)),
         *(acceptance._LEAST_DEVIATION, acceptance._LEAST_TURN_DEG),
         *(acceptance._FOCAL_OFF, acceptance._FOCAL_DEVIATIONS),

@@ -7,7 +7,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.rotations import rotation_error_deg
 
@@ -60,8 +60,8 @@ def test_the_input_is_required_so_that_every_runtime_uses_it(bundle, model):
 
 @kinds
 def test_the_training_camera_is_the_default(bundle):
-    localiser, frame = Localiser(bundle), bundle / "frames/2.png"
-    stated, unstated = localiser.localise(frame, RENDERED), localiser.localise(frame)
+    localizer, frame = Localizer(bundle), bundle / "frames/2.png"
+    stated, unstated = localizer.localize(frame, RENDERED), localizer.localize(frame)
     np.testing.assert_allclose(unstated.position_m, stated.position_m, atol=1e-4)
     assert rotation_error_deg(unstated.quaternion, stated.quaternion) < 0.01
 
@@ -69,8 +69,8 @@ def test_the_training_camera_is_the_default(bundle):
 @kinds
 def test_a_camera_that_looks_elsewhere_is_turned_by_as_much(bundle):
     """With the principal point moved, every ray turns, and the pose that is solved from them turns back."""
-    localiser, frame = Localiser(bundle), cv2.imread(str(bundle / "frames/2.png"))[..., ::-1]
+    localizer, frame = Localizer(bundle), cv2.imread(str(bundle / "frames/2.png"))[..., ::-1]
     moved = [[144, 0, 79.5 + 144 * np.tan(np.radians(10))], [0, 144, 59.5], [0, 0, 1]]
-    found, turned = (localiser.localise(frame, intrinsics) for intrinsics in (RENDERED, moved))
+    found, turned = (localizer.localize(frame, intrinsics) for intrinsics in (RENDERED, moved))
     np.testing.assert_allclose(turned.position_m, found.position_m, atol=1e-5)  # votes know no camera
     assert rotation_error_deg(turned.quaternion, found.quaternion) == pytest.approx(10, abs=2)

@@ -10,10 +10,10 @@ import torch
 
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.evaluation.predict import localise_test_frames
+from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.export import contract_of, export_onnx, quantisation, write_bundle
 from mambaloc.export.quantisation import eight_bit, median_errors, sensitive_nodes
-from mambaloc.metrics import summarise
+from mambaloc.metrics import summarize
 from mambaloc.models.student import LitStudent
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("converted_once")]
@@ -46,7 +46,7 @@ def int8(network, data):
 
 def test_medians_in_onnx_runtime_are_those_of_an_evaluation(network, student, data):
     data.setup("test")
-    expected = summarise(localise_test_frames(student, data, "cpu"))
+    expected = summarize(localize_test_frames(student, data, "cpu"))
     assert median_errors(network, data) == pytest.approx(expected, rel=1e-4)
 
 
@@ -74,8 +74,8 @@ def test_what_is_kept_when_all_layers_lose_too_much(network, data, monkeypatch):
     assert not found.fits
     assert "left out" in str(found)
     kept = sensitive_nodes(quantisation._prepared(network).graph)
-    quantised = {name for node in found.model.graph.node if node.name in kept for name in node.input}
-    assert not any("Dequantize" in name for name in quantised)
+    quantized = {name for node in found.model.graph.node if node.name in kept for name in node.input}
+    assert not any("Dequantize" in name for name in quantized)
 
 
 def test_the_first_layer_the_gates_and_the_heads_are_sensitive():
@@ -112,7 +112,7 @@ def test_a_bundle_leaves_out_what_loses_too_much(student, data, tmp_path, monkey
     assert [path.name for path in tmp_path.iterdir()] == ["bundle"]
 
 
-def test_without_training_frames_nothing_is_quantised(network, scenes, tmp_path):
+def test_without_training_frames_nothing_is_quantized(network, scenes, tmp_path):
     shutil.copytree(scenes / "heads", tmp_path / "heads")
     (tmp_path / "heads/TrainSplit.txt").unlink()
     data = PoseDataModule("7scenes", str(tmp_path), "heads", image_size=(32, 40), short_side=36)

@@ -98,7 +98,7 @@ def test_transform_is_the_matrix_on_homogeneous_points():
     assert_close(transform(pose, points), (scipy_matrix(pose) @ homogeneous[..., None])[:, :3, 0])
 
 
-def test_camera_centre_is_the_position():
+def test_camera_center_is_the_position():
     world_from_cam = random_pose(50)
     assert_close(transform(world_from_cam, torch.zeros(3, dtype=F64)), world_from_cam.position_m)
     assert_close(transform(world_from_cam.inverse(), world_from_cam.position_m), torch.zeros(50, 3, dtype=F64))

@@ -79,10 +79,10 @@ def test_position_is_scipys_least_squares(prior_weight):
     actual = intersect_rays(*given, prior_weight).numpy()
     for row in range(5):
 
-        def residuals(centre, row=row):
-            offset = points[row] - centre
+        def residuals(center, row=row):
+            offset = points[row] - center
             across = offset - (offset * rays[row]).sum(-1, keepdims=True) * rays[row]
-            pull = np.sqrt(prior_weight) * (centre - prior[row])
+            pull = np.sqrt(prior_weight) * (center - prior[row])
             return np.concatenate(((np.sqrt(weights[row])[:, None] * across).ravel(), pull))
 
         np.testing.assert_allclose(actual[row], least_squares(residuals, np.zeros(3)).x, atol=1e-6)
@@ -90,14 +90,14 @@ def test_position_is_scipys_least_squares(prior_weight):
 
 def test_exact_points_give_the_camera_in_single_precision():
     rng = np.random.default_rng(4)
-    centre, rays = rng.normal(size=(50, 1, 3)), directions(rng, 50)
-    points = centre + rays * rng.uniform(1, 5, size=(50, 48, 1))
+    center, rays = rng.normal(size=(50, 1, 3)), directions(rng, 50)
+    points = center + rays * rng.uniform(1, 5, size=(50, 48, 1))
     given = [torch.from_numpy(each).float() for each in (rays, points, np.full((50, 48), 1 / 48))]
     actual = intersect_rays(*given, torch.zeros(50, 3), 0.0)
-    np.testing.assert_allclose(actual.numpy(), centre[:, 0], atol=1e-4)
+    np.testing.assert_allclose(actual.numpy(), center[:, 0], atol=1e-4)
 
 
-def test_rays_meet_the_cells_centres():
+def test_rays_meet_the_cells_centers():
     intrinsics = torch.tensor([[[100.0, 0, 63.5], [0, 90.0, 47.5], [0, 0, 1]]])
     rays = grid_rays(intrinsics, (96, 128), (6, 8))
     assert rays.shape == (1, 48, 3)

@@ -28,8 +28,8 @@ def room() -> Room:
 def rendered_once(made_once, request) -> Rendered:
     """Forty frames of a walk, distorted by OpenCV's own inverse of the lens; read only."""
     walk = embedded_walk(40, seed=3, start_deg=20.0, step_deg=2.4)
-    centre = ((SIZE[0] - 1) / 2 + 1.5, (SIZE[1] - 1) / 2 - 1.0)
-    matrix = np.array([[FOCAL_PX, 0, centre[0]], [0, FOCAL_PX, centre[1]], [0, 0, 1]])
+    center = ((SIZE[0] - 1) / 2 + 1.5, (SIZE[1] - 1) / 2 - 1.0)
+    matrix = np.array([[FOCAL_PX, 0, center[0]], [0, FOCAL_PX, center[1]], [0, 0, 1]])
     coefficients = np.array([*LENS.values()])
 
     def make(folder: Path) -> None:

@@ -64,7 +64,7 @@ def test_a_scene_is_read_back_as_it_was(scene, tmp_path):
     assert list(capture.split) == [row.split for row in told]
     (camera,), (given,) = capture.cameras.values(), json.loads((scene / "scene.json").read_text())["cameras"].values()
     assert list(camera.focal_px) == pytest.approx(given["focal_px"])
-    assert list(camera.centre_px) == pytest.approx(given["centre_px"])
+    assert list(camera.center_px) == pytest.approx(given["centre_px"])
     assert capture.images[0].read_bytes() == told[0].image.read_bytes()
 
 

@@ -1,4 +1,4 @@
-"""A lens from the capture to the query: pictures as the camera stores them are localised as the scene's own are."""
+"""A lens from the capture to the query: pictures as the camera stores them are localized as the scene's own are."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mambaloc.mapping import MapSettings, build_map
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import recipe_of
 from mambaloc.runtime.camera_models import OpenCVModel
-from mambaloc.runtime.localiser import Localiser
+from mambaloc.runtime.localizer import Localizer
 from mambaloc.runtime.maps import SparseMap
 from mambaloc.runtime.undistortion import Undistortion
 
@@ -84,7 +84,7 @@ def test_a_scene_keeps_the_lens_of_its_camera(imported_once, rendered_once):
     assert isinstance(found.lens, OpenCVModel)
     assert found.lens.coefficients == (LENS["k1"], LENS["k2"], LENS["p1"], LENS["p2"], 0.0)
     np.testing.assert_allclose(found.lens.focal_px, rendered_once.matrix[[0, 1], [0, 1]])
-    np.testing.assert_allclose(found.lens.centre_px, rendered_once.matrix[:2, 2])
+    np.testing.assert_allclose(found.lens.center_px, rendered_once.matrix[:2, 2])
     assert found.leaves.size == (camera["width"], camera["height"])
     assert list(found.leaves.focal_px) == camera["focal_px"]
     assert PoseDataModule(scene=str(imported_once), image_size=64, short_side=96).undistortion == found
@@ -198,8 +198,8 @@ def test_stored_pictures_get_the_poses_of_the_copies(mapped, queries, rendered_o
         off = Rotation.from_quat(poses[name][:, 3:]).inv() * Rotation.from_matrix(truth[:, :3, :3])
         assert off_m[name].max() < position_m
         assert np.degrees(off.magnitude()).max() < turn_deg
-    localiser = Localiser(mapped)
-    wrong = [localiser.localise(path).position_m for path in sorted((queries / "stored").iterdir())]
+    localizer = Localizer(mapped)
+    wrong = [localizer.localize(path).position_m for path in sorted((queries / "stored").iterdir())]
     off_m["wrong"] = np.linalg.norm(wrong - truth[:, :3, 3], axis=1)
     assert np.nanmedian(off_m["wrong"]) > 3 * np.median(off_m["stored"])
 

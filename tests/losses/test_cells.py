@@ -59,7 +59,7 @@ def test_each_distance_counts_as_its_weight_says():
     assert loss(replace(prediction, quaternion=-prediction.quaternion), target).item() == pytest.approx(0, abs=1e-5)
 
 
-def test_a_cell_has_the_point_nearest_to_its_centre():
+def test_a_cell_has_the_point_nearest_to_its_center():
     # cells are 16 px wide: the first two lie in the first cell, the third in the last, the others outside or behind
     pixels, depths_m = [(3, 3), (7, 8), (60, 40), (64.6, 20), (30, -0.6), (30, 20)], [2, 3, 4, 5, 6, -1]
     target, _ = batch(pixels, depths_m)

@@ -73,17 +73,17 @@ def test_the_least_squares_are_those_of_scipy(with_depth):
     found = scene.adjusted(given, scene.points, depth=depth)
 
     def residuals(x):
-        turn, centre, points = np.split(x, (3 * FRAMES, 6 * FRAMES))
-        turn, centre, points = (each.reshape(-1, 3) for each in (turn, centre, points))
+        turn, center, points = np.split(x, (3 * FRAMES, 6 * FRAMES))
+        turn, center, points = (each.reshape(-1, 3) for each in (turn, center, points))
         rotation = Rotation.from_rotvec(turn) * Rotation.from_matrix(given[:, :3, :3])
-        cam = rotation[seen.frame].inv().apply(points[seen.track] - centre[seen.frame])
+        cam = rotation[seen.frame].inv().apply(points[seen.track] - center[seen.frame])
         off = (cam[:, :2] / cam[:, 2:] - seen.rays) / SIGMA
         if depth is not None:
             off = np.column_stack((off, np.where(np.isfinite(depth), (cam[:, 2] / depth - 1) / 0.02, 0)))
         square = (off**2).sum(axis=1, keepdims=True) + 1e-12
         cauchy = off * np.sqrt(np.log1p(square) / square)  # whose squares sum to Cauchy's cost
         return np.concatenate(
-            (cauchy.ravel(), (turn / DRIFT[1]).ravel(), ((centre - given[:, :3, 3]) / DRIFT[0]).ravel())
+            (cauchy.ravel(), (turn / DRIFT[1]).ravel(), ((center - given[:, :3, 3]) / DRIFT[0]).ravel())
         )
 
     turn = Rotation.from_matrix(found.world_from_cam[:, :3, :3]) * Rotation.from_matrix(given[:, :3, :3]).inv()

@@ -14,7 +14,7 @@ from mambaloc.errors import InputError
 from mambaloc.mapping import MapSettings, PosedFrames, build_map
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.pairs import pairs_by_pose
-from mambaloc.runtime.maps import MapLocaliser, SparseMap
+from mambaloc.runtime.maps import MapLocalizer, SparseMap
 from mambaloc.runtime.maps.absolute_pose import CameraPose
 from mambaloc.runtime.maps.features import Features, rescaled_intrinsics
 
@@ -46,11 +46,11 @@ def test_points_lie_on_what_the_frames_see(room, walk):
     assert np.median(off) < 0.012
 
 
-def test_frames_of_another_walk_are_localised(room, other_walk):
+def test_frames_of_another_walk_are_localized(room, other_walk):
     """Measured: medians of 0.007 m and 0.13 deg, worst 0.022 m."""
-    localiser = MapLocaliser(room)
+    localizer = MapLocalizer(room)
     frames = other_walk.frames
-    found = [localiser.localise(image, k) for image, k in zip(frames.images, frames.intrinsics, strict=True)]
+    found = [localizer.localize(image, k) for image, k in zip(frames.images, frames.intrinsics, strict=True)]
     errors = np.array([_errors(*each) for each in zip(found, frames.world_from_cam, strict=True)])
     assert all(each.is_accepted for each in found)
     assert (np.median(errors, axis=0) < (0.010, 0.2)).all()
@@ -71,12 +71,12 @@ def test_the_same_map_comes_of_any_number_of_threads(room, walk):
 
 def test_the_same_answer_comes_of_the_same_seed(room, other_walk):
     image, k = other_walk.frames.images[0], other_walk.frames.intrinsics[0]
-    first, second = (MapLocaliser(room, seed=3).localise(image, k) for _ in range(2))
+    first, second = (MapLocalizer(room, seed=3).localize(image, k) for _ in range(2))
     np.testing.assert_array_equal(first.position_m, second.position_m)
     np.testing.assert_array_equal(first.covariance, second.covariance)
 
 
-def test_a_larger_picture_and_a_part_of_one_are_localised(room, other_walk):
+def test_a_larger_picture_and_a_part_of_one_are_localized(room, other_walk):
     """Pictures of another size and aspect: twice as large; and the left three quarters, with the same camera."""
     image, k, truth = (
         other_walk.frames.images[4],
@@ -85,11 +85,11 @@ def test_a_larger_picture_and_a_part_of_one_are_localised(room, other_walk):
     )
     large, larger_k = image.repeat(2, axis=0).repeat(2, axis=1), np.diag((2, 2, 1)) @ k
     larger_k[:2, 2] += 0.5
-    localiser = MapLocaliser(room)
+    localizer = MapLocalizer(room)
     for found in (
-        localiser.localise(large, larger_k),
-        localiser.localise(image[:, :120], k),
-        localiser.localise(large),
+        localizer.localize(large, larger_k),
+        localizer.localize(image[:, :120], k),
+        localizer.localize(large),
     ):
         assert found.is_accepted
         assert _errors(found, truth)[0] < 0.08
@@ -107,7 +107,7 @@ def test_points_have_room_in_the_budget(room, walk):
 
 
 def test_a_picture_of_nothing_has_no_pose(room):
-    found = MapLocaliser(room).localise(np.full((120, 160, 3), 128, np.uint8))
+    found = MapLocalizer(room).localize(np.full((120, 160, 3), 128, np.uint8))
     assert not found.is_accepted
     assert found.inliers == 0
     assert np.isnan(found.position_m).all()
@@ -115,19 +115,19 @@ def test_a_picture_of_nothing_has_no_pose(room):
 
 def test_a_picture_of_another_place_is_not_accepted(room):
     noise = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8).repeat(4, 0).repeat(4, 1)
-    assert not MapLocaliser(room).localise(noise).is_accepted
+    assert not MapLocalizer(room).localize(noise).is_accepted
 
 
 def test_another_shape_needs_its_camera(room):
     with pytest.raises(InputError, match=r"picture of 120x160: .*Give its intrinsics"):
-        MapLocaliser(room).localise(np.zeros((160, 120, 3), np.uint8))
+        MapLocalizer(room).localize(np.zeros((160, 120, 3), np.uint8))
 
 
 def test_another_cameras_intrinsics_are_refused(room, other_walk):
     with pytest.raises(InputError, match=r"cannot be the camera of a picture of 160x120"):
-        MapLocaliser(room).localise(other_walk.frames.images[0], np.diag((4, 4, 1)) @ other_walk.frames.intrinsics[0])
+        MapLocalizer(room).localize(other_walk.frames.images[0], np.diag((4, 4, 1)) @ other_walk.frames.intrinsics[0])
     with pytest.raises(InputError, match=r"cannot be the camera"):
-        MapLocaliser(room).localise(other_walk.frames.images[0], np.zeros(3))
+        MapLocalizer(room).localize(other_walk.frames.images[0], np.zeros(3))
 
 
 def _frames(walk, **changes):
@@ -223,14 +223,14 @@ def test_pictures_are_not_enlarged(walk):
 @pytest.mark.parametrize(("off_m", "off_deg"), [(0.0, 0), (0.3, 8), (5.0, 170)])
 def test_a_prior_never_makes_an_answer_worse(room, other_walk, off_m, off_deg):
     """Whether it is right, off, or wild; pictures of which a third is left."""
-    localiser, frames = MapLocaliser(room), other_walk.frames
+    localizer, frames = MapLocalizer(room), other_walk.frames
     for row in range(0, 16, 3):
         image, truth = frames.images[row].copy(), frames.world_from_cam[row]
         image[:, 55:] = 128
         turn = Rotation.from_rotvec(np.radians(off_deg) * np.array([0, 0.8, 0.6])).as_matrix()
         prior = CameraPose(turn @ truth[:3, :3], truth[:3, 3] + off_m * np.array([0.6, 0.8, 0]))
-        alone = localiser.localise(image, frames.intrinsics[row])
-        both = localiser.localise(image, frames.intrinsics[row], prior)
+        alone = localizer.localize(image, frames.intrinsics[row])
+        both = localizer.localize(image, frames.intrinsics[row], prior)
         assert both.is_accepted >= alone.is_accepted
         if both.is_accepted:
             assert _errors(both, truth)[0] < 0.1
@@ -238,10 +238,10 @@ def test_a_prior_never_makes_an_answer_worse(room, other_walk, off_m, off_deg):
 
 
 def test_the_lens_of_the_maps_camera_is_that_of_smaller_pictures_too(room):
-    localiser = MapLocaliser(room)
+    localizer = MapLocalizer(room)
     width, height = room.size
     for size, own in (((width, height), True), ((width // 4, height // 4), True), ((width, width), False)):
         matrix = rescaled_intrinsics(room.intrinsics, room.size, size)
         features = Features(np.empty((0, 2)), np.empty((0, 128), np.float32), matrix, size)
-        assert localiser._is_own_camera(features) == own
-        assert not localiser._is_own_camera(replace(features, intrinsics=matrix * [[1.05], [1.05], [1]]))
+        assert localizer._is_own_camera(features) == own
+        assert not localizer._is_own_camera(replace(features, intrinsics=matrix * [[1.05], [1.05], [1]]))

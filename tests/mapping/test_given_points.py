@@ -50,7 +50,7 @@ def test_points_and_poses_are_used_as_they_are(room, given):
     assert describe_points(room) == f"points from COLMAP: {len(room)}"
 
 
-def test_frames_of_another_walk_are_localised(room, other_walk):
+def test_frames_of_another_walk_are_localized(room, other_walk):
     """Measured: a median of 0.006 m, worst 0.02 m."""
     found = measure(room, other_walk.frames, (0,))
     assert found.is_accepted.all()

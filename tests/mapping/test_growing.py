@@ -11,16 +11,16 @@ from mambaloc.errors import InputError
 from mambaloc.mapping.evaluating import measure
 from mambaloc.mapping.growing import NewFrame, add_frames, remove_session
 from mambaloc.mapping.new_frames import read_new_frames
-from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import CameraPose, MapLocalizer, SparseMap
 
 ROWS = np.arange(34, 58, 2)  # of the walk: the map's last frames know the first of them, the rest is new
 
 
 def _new(sparse_map, walk, rows, with_poses, move_m=0.0):
-    localiser = MapLocaliser(sparse_map)
+    localizer = MapLocalizer(sparse_map)
     frames = walk.frames.select(rows)
     poses = [CameraPose(pose[:3, :3], pose[:3, 3] + move_m) if with_poses else None for pose in frames.world_from_cam]
-    found = [localiser.features(image, k) for image, k in zip(frames.images, frames.intrinsics, strict=True)]
+    found = [localizer.features(image, k) for image, k in zip(frames.images, frames.intrinsics, strict=True)]
     return [NewFrame(str(row), *each) for row, *each in zip(rows, found, poses, strict=True)]
 
 
@@ -106,11 +106,11 @@ def test_answers_near_added_frames_are_in_the_frame_of_their_given_poses(part, w
     ]
     grown = add_frames(part, moved, "second", 20).sparse_map
     assert len(grown.drift) == len(grown.key_poses)
-    localiser = MapLocaliser(grown)
+    localizer = MapLocalizer(grown)
     for rows, right in ((np.arange(51, 57, 2), shift), (np.arange(5, 15, 3), 0 * shift)):
         these = walk.frames.select(rows)
         found = [
-            localiser.localise(image, k).position_m for image, k in zip(these.images, these.intrinsics, strict=True)
+            localizer.localize(image, k).position_m for image, k in zip(these.images, these.intrinsics, strict=True)
         ]
         off = np.median(np.array(found) - these.world_from_cam[:, :3, 3], axis=0)
         np.testing.assert_allclose(off, right, atol=0.008)
@@ -142,7 +142,7 @@ def test_key_frames_are_limited_and_spread(part, walk):
 def test_another_place_adds_nothing(part):
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 255, (30, 40, 3), dtype=np.uint8).repeat(4, 0).repeat(4, 1) for _ in range(3)]
-    frames = [NewFrame(str(row), MapLocaliser(part).features(image)) for row, image in enumerate(noise)]
+    frames = [NewFrame(str(row), MapLocalizer(part).features(image)) for row, image in enumerate(noise)]
     with pytest.raises(InputError, match=r"^attic: the map finds none of 3 frames\. Check that they show the same"):
         add_frames(part, frames, "attic", 20)
 
@@ -176,21 +176,21 @@ def test_films_and_folders_are_read_with_the_maps_camera(part, walk, tmp_path):
     folder.mkdir()
     for row, image in enumerate(images):
         cv2.imwrite(str(folder / f"{row}.png"), image[..., ::-1])
-    localiser = MapLocaliser(part)
-    pictures = read_new_frames(folder, localiser)
-    film = read_new_frames(_film(tmp_path / "film.avi", images), localiser)
+    localizer = MapLocalizer(part)
+    pictures = read_new_frames(folder, localizer)
+    film = read_new_frames(_film(tmp_path / "film.avi", images), localizer)
     assert [frame.name for frame in pictures] == ["0.png", "1.png", "2.png", "3.png"]
     assert [frame.name for frame in film] == ["0", "1", "2", "3"]
     for frame in (*pictures, *film):
         assert frame.given is None
         np.testing.assert_array_equal(frame.features.intrinsics, part.intrinsics)
-        assert localiser.localise_features(frame.features).is_accepted
+        assert localizer.localize_features(frame.features).is_accepted
 
 
 def test_a_long_film_is_thinned(part, walk, tmp_path, monkeypatch):
     monkeypatch.setattr("mambaloc.mapping.new_frames._MOST_FRAMES", 4)
     film = _film(tmp_path / "film.avi", [walk.frames.images[20]] * 10)
-    assert [frame.name for frame in read_new_frames(film, MapLocaliser(part))] == ["0", "3", "6", "9"]
+    assert [frame.name for frame in read_new_frames(film, MapLocalizer(part))] == ["0", "3", "6", "9"]
 
 
 def test_pictures_of_another_camera_are_refused_or_named(part, walk, tmp_path):
@@ -204,20 +204,20 @@ def test_pictures_of_another_camera_are_refused_or_named(part, walk, tmp_path):
     with pytest.raises(
         InputError, match=r"fit a focal length about 1\.\d+ times the map's\. .*--intrinsics FX,FY,CX,CY"
     ):
-        read_new_frames(tmp_path, MapLocaliser(part))
+        read_new_frames(tmp_path, MapLocalizer(part))
     zoom = np.diag((160 / 112, 120 / 84, 1))
     intrinsics = zoom @ part.intrinsics
     intrinsics[:2, 2] = (79.5, 59.5)
-    frames = read_new_frames(tmp_path, MapLocaliser(part), intrinsics)
-    assert all(MapLocaliser(part).localise_features(frame.features).is_accepted for frame in frames)
+    frames = read_new_frames(tmp_path, MapLocalizer(part), intrinsics)
+    assert all(MapLocalizer(part).localize_features(frame.features).is_accepted for frame in frames)
 
 
 def test_pictures_of_another_shape_need_their_camera(part, tmp_path):
     cv2.imwrite(str(tmp_path / "tall.png"), np.zeros((160, 120, 3), np.uint8))
     with pytest.raises(InputError, match=r"picture of 120x160: its shape differs .* Give its intrinsics"):
-        read_new_frames(tmp_path, MapLocaliser(part))
+        read_new_frames(tmp_path, MapLocalizer(part))
 
 
 def test_an_empty_folder_is_refused(part, tmp_path):
     with pytest.raises(InputError, match=r"holds no picture"):
-        read_new_frames(tmp_path, MapLocaliser(part))
+        read_new_frames(tmp_path, MapLocalizer(part))

@@ -148,7 +148,7 @@ def blocks():
     return str(folder)
 
 
-def test_real_frames_are_localised_to_centimetres(blocks, tmp_path):
+def test_real_frames_are_localized_to_centimetres(blocks, tmp_path):
     """Redkitchen seq-01 blocks (800/200), 40 key frames at 160x120; measured: 0.041 m / 0.93 deg."""
     recipe = MapRecipe("redkitchen", root=blocks, settings=MapSettings(40, 160, 2**18), ransac_seeds=(0,))
     metrics = build_and_measure(recipe, tmp_path).result["metrics"]

@@ -12,8 +12,8 @@ from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.structure import recover_structure
 from mambaloc.mapping.tracks import match
 from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render, sensor
-from mambaloc.runtime.localiser import Localiser
-from mambaloc.runtime.maps import MAP_FILE, MapLocaliser
+from mambaloc.runtime.localizer import Localizer
+from mambaloc.runtime.maps import MAP_FILE, MapLocalizer
 from mambaloc.runtime.maps.features import detect_features
 
 # The second is off centre, of pixels that are not square, and upright.
@@ -47,13 +47,13 @@ def errors(found, truth):
     return np.linalg.norm(found.position_m - truth[:3, 3]), np.degrees(turn.magnitude())
 
 
-def test_pictures_of_both_cameras_are_localised(room, queries, tmp_path):
+def test_pictures_of_both_cameras_are_localized(room, queries, tmp_path):
     """In the map and in its file through the runtime; measured: medians of 0.014 m, 0.25 deg and 0.007 m, 0.14 deg."""
     assert room.size == (120, 90)
     assert room.lens.numbers == pytest.approx((1, 0), abs=1e-6)  # of several cameras none is fitted
     room.save(tmp_path / MAP_FILE)
-    for localiser in (MapLocaliser(room), Localiser(tmp_path / MAP_FILE)):
-        found = [localiser.localise(*each) for each in zip(queries.images, queries.intrinsics, strict=True)]
+    for localizer in (MapLocalizer(room), Localizer(tmp_path / MAP_FILE)):
+        found = [localizer.localize(*each) for each in zip(queries.images, queries.intrinsics, strict=True)]
         off = np.array([errors(*each) for each in zip(found, queries.world_from_cam, strict=True)])
         assert all(each.is_accepted for each in found)
         for camera in range(2):
@@ -77,7 +77,7 @@ def test_a_fitted_focal_length_mends_a_map(queries):
         matrices = scaled(frames, scale[camera])
         sparse_map = build_map(replace(frames, intrinsics=matrices), MapSettings(key_frames=64, width=120), "room")
         shots = zip(queries.images, scaled(queries, scale[camera[: len(queries)]]), strict=True)
-        found = [MapLocaliser(sparse_map).localise(*shot) for shot in shots]
+        found = [MapLocalizer(sparse_map).localize(*shot) for shot in shots]
         off[name] = np.median([errors(*each)[0] for each in zip(found, queries.world_from_cam, strict=True)])
     print(fitted, off)
     assert off["fitted"] < 0.4 * off["claimed"]
@@ -92,13 +92,13 @@ def scaled(frames, scale):
 
 def test_the_other_cameras_matrix_is_seen_to_be_wrong(room, queries):
     """The focal length is a quarter too short."""
-    localiser = MapLocaliser(room)
+    localizer = MapLocalizer(room)
     wrong = CAMERAS[1][0] * [[0.75, 1, 1], [1, 0.75, 1], [1, 1, 1]]
-    found = [localiser.localise(image, wrong) for image in queries.images[1::2]]
+    found = [localizer.localize(image, wrong) for image in queries.images[1::2]]
     assert not any(each.is_accepted for each in found)
 
 
 def test_a_picture_of_another_shape_has_no_camera_by_default(room, queries):
-    MapLocaliser(room).localise(queries.images[0])
+    MapLocalizer(room).localize(queries.images[0])
     with pytest.raises(InputError, match=r"picture of 120x160: .*Give its intrinsics"):
-        MapLocaliser(room).localise(queries.images[1])
+        MapLocalizer(room).localize(queries.images[1])

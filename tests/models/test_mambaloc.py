@@ -226,14 +226,14 @@ def test_position_scale_by_hand():
     assert_close(scale.scale_m, torch.tensor(1e-3))  # a camera that stands still divides by no zero
 
 
-@pytest.mark.parametrize("normalise", [True, False])
-def test_position_statistics_are_taken_from_training_and_saved(tmp_path, normalise):
-    system, scene = small(normalise_position=normalise), Scene()
+@pytest.mark.parametrize("normalize", [True, False])
+def test_position_statistics_are_taken_from_training_and_saved(tmp_path, normalize):
+    system, scene = small(normalise_position=normalize), Scene()
     run = trainer(tmp_path)
     run.fit(system, datamodule=scene)
     run.save_checkpoint(tmp_path / "last.ckpt")
     mean_m = Checkpoint.read(tmp_path / "last.ckpt").system().network.head.position_scale.mean_m
-    assert_close(mean_m, scene.train_position_m.mean(0) if normalise else torch.zeros(3))
+    assert_close(mean_m, scene.train_position_m.mean(0) if normalize else torch.zeros(3))
 
 
 def test_the_same_start_gives_the_same_training(tmp_path):

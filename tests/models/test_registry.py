@@ -14,7 +14,7 @@ from mambaloc.types import PosePrediction
 
 
 class Mean(nn.Module):
-    """The smallest localiser: a linear map of the mean colour."""
+    """The smallest localizer: a linear map of the mean colour."""
 
     def __init__(self, gain: float = 1.0) -> None:
         super().__init__()

@@ -94,7 +94,7 @@ def test_grids_are_the_maps_sizes_and_leave_no_trace(size):
 
 @torch.no_grad()
 @pytest.mark.parametrize("given", [None, (0.1, 0.5, 0.7)])
-def test_images_are_normalised_by_mean_and_deviation(given):
+def test_images_are_normalized_by_mean_and_deviation(given):
     backbone = Backbone(SMALL, pixel_mean=given, pixel_std=given).eval()
     config = timm.get_pretrained_cfg(SMALL)
     mean, std = (torch.tensor(given or value).view(1, 3, 1, 1) for value in (config.mean, config.std))

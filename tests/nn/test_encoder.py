@@ -13,7 +13,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def randomise(module: nn.Module) -> nn.Module:
+def randomize(module: nn.Module) -> nn.Module:
     """Move norms and biases off their trivial initial values."""
     torch.manual_seed(1)
     with torch.no_grad():
@@ -24,12 +24,12 @@ def randomise(module: nn.Module) -> nn.Module:
 
 def layer(dropout: float = 0.1, attention_dropout: float = 0.0) -> EncoderLayer:
     torch.manual_seed(0)
-    return randomise(EncoderLayer(DIM, HEADS, HIDDEN, dropout, attention_dropout))
+    return randomize(EncoderLayer(DIM, HEADS, HIDDEN, dropout, attention_dropout))
 
 
 def encoder(grid: tuple[int, int] = (2, 3), layers: int = 2, dropout: float = 0.1) -> TokenEncoder:
     torch.manual_seed(0)
-    return randomise(TokenEncoder(5, grid, DIM, layers, HEADS, HIDDEN, dropout))
+    return randomize(TokenEncoder(5, grid, DIM, layers, HEADS, HIDDEN, dropout))
 
 
 # --- a layer ---------------------------------------------------------------------------------------------------------
@@ -133,8 +133,8 @@ def test_encoder_reads_the_token_through_all_layers_and_the_final_norm(layers):
     for each in ours.layers:
         tokens = second_implementation(each, tokens, ours.positions())
     token = tokens[:, 0]
-    centred = token - token.mean(-1, keepdim=True)
-    normed = centred / (centred.square().mean(-1, keepdim=True) + ours.norm.eps).sqrt()
+    centered = token - token.mean(-1, keepdim=True)
+    normed = centered / (centered.square().mean(-1, keepdim=True) + ours.norm.eps).sqrt()
     assert_close(ours(feats), normed * ours.norm.weight + ours.norm.bias, rtol=1e-4, atol=1e-4)
     assert len(ours.layers) == layers
 

@@ -103,6 +103,6 @@ def test_an_unknown_mode_is_named(build):
 
 
 @pytest.mark.parametrize("mode", ["classical", "gis"])
-def test_build_gis_hands_mode_and_discretisation_on(mode):
+def test_build_gis_hands_mode_and_discretization_on(mode):
     block = build_gis(mode, 8, "zoh")
     assert (block.mode, block.mixer.discretisation) == (mode, "zoh")

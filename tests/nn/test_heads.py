@@ -13,14 +13,14 @@ def test_head_regresses_in_float32_under_autocast():
     assert torch.equal(regressed, head(feats))
 
 
-def test_position_scale_undoes_the_normalisation_it_was_fitted_to():
+def test_position_scale_undoes_the_normalization_it_was_fitted_to():
     position_m = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * 3 + torch.tensor([10.0, -5.0, 2.0])
     scale = PositionScale()
     assert torch.equal(scale(position_m), position_m)
     scale.fit(position_m)
-    normalised = (position_m - position_m.mean(0)) / scale.scale_m
-    assert normalised.norm(dim=1).square().mean().item() == pytest.approx(1, rel=1e-5)
-    torch.testing.assert_close(scale(normalised), position_m)
+    normalized = (position_m - position_m.mean(0)) / scale.scale_m
+    assert normalized.norm(dim=1).square().mean().item() == pytest.approx(1, rel=1e-5)
+    torch.testing.assert_close(scale(normalized), position_m)
 
 
 def test_position_scale_of_one_place_is_finite():

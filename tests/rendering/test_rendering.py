@@ -20,8 +20,8 @@ INSIDE_M = np.array([[-1.25, -1.0, 1.1], [1.25, 1.0, 1.7]])
 RED, GREEN, BLUE, WHITE, GREY = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (90, 90, 90)
 
 
-def flat(colour, size=(64, 64)):
-    return np.full((*size, 3), colour, dtype=np.uint8)
+def flat(color, size=(64, 64)):
+    return np.full((*size, 3), color, dtype=np.uint8)
 
 
 def room_of(*quads):
@@ -73,10 +73,10 @@ def test_texture_is_upright_and_sampled_where_opencv_projects_it(seed):
     picture = quad((-0.6, -0.4, 3), (1.2, 0, 0.5), (0, 0.9, -0.2), texture)
     pose = camera(seed)
     rgb, _ = render(room_of(picture), K, pose, SIZE)
-    for (s, t), colour in {(0.3, 0.3): RED, (0.7, 0.3): GREEN, (0.3, 0.7): BLUE, (0.7, 0.7): WHITE}.items():
+    for (s, t), color in {(0.3, 0.3): RED, (0.7, 0.3): GREEN, (0.3, 0.7): BLUE, (0.7, 0.7): WHITE}.items():
         point = picture.corner_m + s * picture.u_m + t * picture.v_m
         x, y = np.round(projected([point], pose)[0]).astype(int)
-        assert tuple(rgb[y, x]) == colour
+        assert tuple(rgb[y, x]) == color
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3])

@@ -8,7 +8,7 @@ import warnings
 import cv2
 import numpy as np
 import pytest
-from films import COLOURS, coloured_film, patches
+from films import COLORS, colored_film, patches
 
 from mambaloc.errors import InputWarning
 from mambaloc.images import read_image
@@ -97,14 +97,14 @@ def test_a_damaged_film_says_nothing_of_itself(tmp_path, at):
 
 
 @pytest.mark.parametrize("standard", ["bt601", "bt709"])
-def test_a_films_colours_are_those_of_its_tag(tmp_path, standard):
+def test_a_films_colors_are_those_of_its_tag(tmp_path, standard):
     """Guess: OpenCV heeds a film's matrix. 4.12 takes every film for BT.601, up to 28 levels off; 5.0 heeds it.
 
     The film was made for these colours by the standard's matrix; its encoder is off by up to 5 levels itself.
     """
-    path = coloured_film(tmp_path / "a.webm", standard)
+    path = colored_film(tmp_path / "a.webm", standard)
     frames, _ = frames_of(path)
     first = next(frames)
-    np.testing.assert_allclose(patches(first.image), COLOURS, atol=5)
+    np.testing.assert_allclose(patches(first.image), COLORS, atol=5)
     write_frames([first], tmp_path)  # what an import trains on
     np.testing.assert_allclose(patches(read_image(tmp_path / "000000.jpg")), patches(first.image), atol=3)

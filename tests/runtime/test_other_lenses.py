@@ -14,7 +14,7 @@ import pytest
 from mambaloc.errors import InputError
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.images import read_image
-from mambaloc.runtime import Contract, Localiser, Preprocessing
+from mambaloc.runtime import Contract, Localizer, Preprocessing
 from mambaloc.runtime.contract import MOST_ENLARGED
 from mambaloc.runtime.maps import SparseMap
 from mambaloc.runtime.network import Network
@@ -115,7 +115,7 @@ def test_the_widest_lens_is_enlarged_to_a_limit():
 def test_a_model_is_given_its_inputs_camera(lens, echo):
     (width, height), intrinsics = LENSES[lens]
     size = (height, width)
-    said = Localiser(echo).localise(np.full((*size, 3), 100, np.uint8), intrinsics)
+    said = Localizer(echo).localize(np.full((*size, 3), 100, np.uint8), intrinsics)
     expected = CONTRACT.preprocessing_for(size, intrinsics).crop_from_image(size) @ intrinsics
     np.testing.assert_allclose(said.position_m, expected[0], rtol=1e-6)
     np.testing.assert_allclose(said.quaternion[1:], expected[1], rtol=1e-6)
@@ -126,7 +126,7 @@ def test_a_model_that_takes_pictures_does_it_by_itself(lens, echo, raw_echo):
     (width, height), intrinsics = LENSES[lens]
     coarse = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
     picture = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    expected, said = (Localiser(each).localise(picture, intrinsics) for each in (echo, raw_echo))
+    expected, said = (Localizer(each).localize(picture, intrinsics) for each in (echo, raw_echo))
     np.testing.assert_allclose(said.position_m, expected.position_m, rtol=1e-5)
     np.testing.assert_allclose(said.quaternion[1:], expected.quaternion[1:], rtol=1e-5)
     assert said.quaternion[0] == pytest.approx(expected.quaternion[0], abs=1e-3)  # the picture's mean
@@ -135,7 +135,7 @@ def test_a_model_that_takes_pictures_does_it_by_itself(lens, echo, raw_echo):
 def test_an_unknown_camera_is_taken_for_the_training_camera(echo, raw_echo):
     for each in (echo, raw_echo):
         for size in ((480, 640), (120, 160), (720, 1280)):
-            said = Localiser(each).localise(np.zeros((*size, 3), np.uint8))
+            said = Localizer(each).localize(np.zeros((*size, 3), np.uint8))
             np.testing.assert_allclose(said.position_m, TRAINED[0], rtol=1e-5)
             np.testing.assert_allclose(said.quaternion[1:], TRAINED[1], rtol=1e-5)
 
@@ -144,8 +144,8 @@ def test_a_picture_that_is_too_narrow_needs_its_camera(echo, raw_echo):
     upright = np.zeros((640, 480, 3), np.uint8)
     for each in (echo, raw_echo):
         with pytest.raises(InputError, match="give frames shaped as in training, or their intrinsics"):
-            Localiser(each).localise(upright)
-        assert np.isfinite(Localiser(each).localise(upright, camera(533, 240, 320)).position_m).all()
+            Localizer(each).localize(upright)
+        assert np.isfinite(Localizer(each).localize(upright, camera(533, 240, 320)).position_m).all()
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_a_picture_that_is_too_narrow_needs_its_camera(echo, raw_echo):
 )
 def test_a_camera_that_cannot_be_is_refused(intrinsics, echo):
     with pytest.raises(InputError, match="cannot be the camera of a picture of 640x480") as error:
-        Localiser(echo).localise(np.zeros((480, 640, 3), np.uint8), intrinsics)
+        Localizer(echo).localize(np.zeros((480, 640, 3), np.uint8), intrinsics)
     assert "\n" not in str(error.value)
 
 
@@ -163,9 +163,9 @@ def test_network_and_map_are_given_one_camera(echo, den, map_of_den, monkeypatch
     """A frame without its lowest rows: the map finds its pose only with the true principal point."""
     path = den / "den/seq-02/frame-000002.color.png"
     intrinsics, given = SparseMap.load(map_of_den).intrinsics, []
-    localise = Network.localise
-    monkeypatch.setattr(Network, "localise", lambda self, rgb, k: given.append(k) or localise(self, rgb, k))
-    found = Localiser(echo, 1, map_of_den).localise(read_image(path)[:100], intrinsics)
+    localize = Network.localize
+    monkeypatch.setattr(Network, "localize", lambda self, rgb, k: given.append(k) or localize(self, rgb, k))
+    found = Localizer(echo, 1, map_of_den).localize(read_image(path)[:100], intrinsics)
     assert found.source == "map"
     true_m = np.loadtxt(path.with_name("frame-000002.pose.txt"))[:3, 3]
     np.testing.assert_allclose(found.position_m, true_m, atol=0.03)
@@ -200,8 +200,8 @@ def test_a_contract_with_a_wrong_camera_is_refused(wrong):
 def test_a_model_and_its_contract_agree_on_the_camera(tmp_path):
     without = replace(CONTRACT, intrinsics=None)
     with pytest.raises(InputError, match=r"also takes \['intrinsics'\], as its contract does not say"):
-        Localiser(written(tmp_path / "a.onnx", without))
+        Localizer(written(tmp_path / "a.onnx", without))
     model = onnx.ModelProto.FromString(ECHO.SerializeToString())
     model.graph.input[1].type.tensor_type.shape.dim[2].dim_value = 4
     with pytest.raises(InputError, match="as its contract does not say"):
-        Localiser(written(tmp_path / "b.onnx", CONTRACT, model))
+        Localizer(written(tmp_path / "b.onnx", CONTRACT, model))

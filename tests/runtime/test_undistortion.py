@@ -15,24 +15,24 @@ from mambaloc.errors import InputError
 from mambaloc.export.pages import TARGETS, write_pages
 from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel, Pinhole
 from mambaloc.runtime.contract import Contract
-from mambaloc.runtime.localisation import Localisation
-from mambaloc.runtime.localiser import Localiser
+from mambaloc.runtime.localization import Localization
+from mambaloc.runtime.localizer import Localizer
 from mambaloc.runtime.undistortion import Undistortion, sampled_at, undistorted
 
 STORED = (320, 240)
-FOCAL, CENTRE = (250.0, 245.0), (152.0, 123.0)
+FOCAL, CENTER = (250.0, 245.0), (152.0, 123.0)
 PINHOLE = Undistortion(
-    OpenCVModel(FOCAL, CENTRE, (-0.2, 0.05, 0.003, -0.002, 0.01)), STORED, Pinhole(*STORED, (275.0, 269.5), CENTRE), ""
+    OpenCVModel(FOCAL, CENTER, (-0.2, 0.05, 0.003, -0.002, 0.01)), STORED, Pinhole(*STORED, (275.0, 269.5), CENTER), ""
 )
 FISHEYE = Undistortion(
-    FisheyeModel(FOCAL, CENTRE, (0.02, -0.01, 0.002, -0.001)), STORED, Pinhole(*STORED, (262.5, 257.25), CENTRE), ""
+    FisheyeModel(FOCAL, CENTER, (0.02, -0.01, 0.002, -0.001)), STORED, Pinhole(*STORED, (262.5, 257.25), CENTER), ""
 )
 lenses = pytest.mark.parametrize("known", [PINHOLE, FISHEYE], ids=["pinhole", "fisheye"])
 SPREAD = 150.0  # grey levels a unit of ray
 
 
 def matrix(told):
-    return np.array([[told.focal_px[0], 0, told.centre_px[0]], [0, told.focal_px[1], told.centre_px[1]], [0, 0, 1]])
+    return np.array([[told.focal_px[0], 0, told.center_px[0]], [0, told.focal_px[1], told.center_px[1]], [0, 0, 1]])
 
 
 def stored_picture(known, size):
@@ -53,7 +53,7 @@ def stored_picture(known, size):
 
 @lenses
 @pytest.mark.parametrize("size", [STORED, (160, 120), (640, 480), (427, 320)])
-def test_a_pixels_colour_is_that_of_its_ray(known, size):
+def test_a_pixels_color_is_that_of_its_ray(known, size):
     """Whole or resized, what comes out is a pinhole's picture with the matrix that comes with it."""
     image, intrinsics = known.apply(stored_picture(known, size), "a")
     assert image.shape == (size[1], size[0], 3)
@@ -65,7 +65,7 @@ def test_a_pixels_colour_is_that_of_its_ray(known, size):
 
 @lenses
 def test_what_is_left_is_cropped_to_its_middle(known):
-    left = replace(known.leaves, width=300, centre_px=(CENTRE[0] - 10, CENTRE[1]))
+    left = replace(known.leaves, width=300, center_px=(CENTER[0] - 10, CENTER[1]))
     whole, _ = known.apply(stored_picture(known, STORED), "a")
     middle, intrinsics = replace(known, leaves=left).apply(stored_picture(known, STORED), "a")
     np.testing.assert_array_equal(middle, whole[:, 10:310])
@@ -181,7 +181,7 @@ def test_every_page_says_what_pictures_must_be(target, tmp_path):
     assert "The lens of their camera is not known here:\nnone was kept with it." in page.read_text()
 
 
-# --- a localiser -----------------------------------------------------------------------------------------------------
+# --- a localizer -----------------------------------------------------------------------------------------------------
 
 
 class Echo:
@@ -190,25 +190,25 @@ class Echo:
     def __init__(self, undistortion: Undistortion) -> None:
         self.contract = replace(CONTRACT, undistortion=undistortion)
 
-    def localise(self, rgb, intrinsics=None):
+    def localize(self, rgb, intrinsics=None):
         self.given = rgb, intrinsics
-        return Localisation(np.zeros(3), np.array([1.0, 0, 0, 0]), 0.0)
+        return Localization(np.zeros(3), np.array([1.0, 0, 0, 0]), 0.0)
 
 
-def localiser_of(undistortion):
-    localiser = Localiser.__new__(Localiser)
-    localiser._network, localiser._map, localiser._path = Echo(undistortion), None, "den.onnx"
-    return localiser
+def localizer_of(undistortion):
+    localizer = Localizer.__new__(Localizer)
+    localizer._network, localizer._map, localizer._path = Echo(undistortion), None, "den.onnx"
+    return localizer
 
 
 def test_a_network_is_given_the_undistorted_picture_and_its_camera():
-    picture, localiser = stored_picture(PINHOLE, STORED), localiser_of(PINHOLE)
-    localiser.localise(picture, is_distorted=True)
-    for given, expected in zip(localiser._network.given, PINHOLE.apply(picture, "a"), strict=True):
+    picture, localizer = stored_picture(PINHOLE, STORED), localizer_of(PINHOLE)
+    localizer.localize(picture, is_distorted=True)
+    for given, expected in zip(localizer._network.given, PINHOLE.apply(picture, "a"), strict=True):
         np.testing.assert_array_equal(given, expected)
-    localiser.localise(picture)
-    np.testing.assert_array_equal(localiser._network.given[0], picture)
-    assert localiser._network.given[1] is None
+    localizer.localize(picture)
+    np.testing.assert_array_equal(localizer._network.given[0], picture)
+    assert localizer._network.given[1] is None
 
 
 @pytest.mark.parametrize(
@@ -227,5 +227,5 @@ def test_a_network_is_given_the_undistorted_picture_and_its_camera():
 )
 def test_wrong_uses_are_told_in_one_line(undistortion, size, intrinsics, says):
     with pytest.raises(InputError, match=says) as caught:
-        localiser_of(undistortion).localise(np.zeros((size[1], size[0], 3), np.uint8), intrinsics, is_distorted=True)
+        localizer_of(undistortion).localize(np.zeros((size[1], size[0], 3), np.uint8), intrinsics, is_distorted=True)
     assert "\n" not in str(caught.value)

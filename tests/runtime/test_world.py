@@ -11,8 +11,8 @@ from test_other_lenses import CONTRACT
 from mambaloc.data.datasets.capture import world_of
 from mambaloc.errors import InputError
 from mambaloc.runtime.contract import Contract
-from mambaloc.runtime.localisation import Localisation
-from mambaloc.runtime.localiser import Localiser
+from mambaloc.runtime.localization import Localization
+from mambaloc.runtime.localizer import Localizer
 from mambaloc.runtime.trajectory import write_tum
 from mambaloc.runtime.world import World
 
@@ -24,16 +24,16 @@ class Echo:
 
     contract = Contract(**{**CONTRACT.__dict__, "world": GRID})
 
-    def localise(self, rgb, intrinsics=None):
-        return Localisation(np.array([0.2072, 0.5531, -0.4352], np.float32), np.array([1.0, 0, 0, 0]), 0.0)
+    def localize(self, rgb, intrinsics=None):
+        return Localization(np.array([0.2072, 0.5531, -0.4352], np.float32), np.array([1.0, 0, 0, 0]), 0.0)
 
 
-def test_a_localiser_answers_in_the_sources_world():
-    localiser = Localiser.__new__(Localiser)
-    localiser._network, localiser._map = Echo(), None
-    found = localiser.localise(np.zeros((96, 128, 3), np.uint8))
+def test_a_localizer_answers_in_the_sources_world():
+    localizer = Localizer.__new__(Localizer)
+    localizer._network, localizer._map = Echo(), None
+    found = localizer.localize(np.zeros((96, 128, 3), np.uint8))
     np.testing.assert_allclose(found.position_m, (441548.2072, 5121946.5531, 345.5648), atol=1e-7)
-    assert localiser.world == GRID
+    assert localizer.world == GRID
 
 
 def test_a_trajectory_keeps_millimetres(tmp_path):

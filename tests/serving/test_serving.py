@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from mambaloc.images import read_image
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 from mambaloc.serving.workers import Task, WorkerLostError, Workers
 
 TOKEN = "a token of the tests"
@@ -88,10 +88,10 @@ def form_of(*pictures: bytes):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_the_pose_is_that_of_a_localiser_here(server, bundles, frame, suffix):
+def test_the_pose_is_that_of_a_localizer_here(server, bundles, frame, suffix):
     data = cv2.imencode(suffix, cv2.cvtColor(read_image(frame), cv2.COLOR_RGB2BGR))[1].tobytes()
     picture = cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    expected = Localiser(bundles / "den", threads=1).localise(picture)
+    expected = Localizer(bundles / "den", threads=1).localize(picture)
     status, found = ask(server[0], "/localize/den", data)
     assert status == 200
     assert (found["bundle"], found["source"]) == ("den", "network")
@@ -101,12 +101,12 @@ def test_the_pose_is_that_of_a_localiser_here(server, bundles, frame, suffix):
 
 def test_intrinsics_reach_the_network(server, bundles):
     picture = sorted((bundles / "lenses/frames").glob("*.png"))[0]
-    localiser = Localiser(bundles / "lenses", threads=1)
+    localizer = Localizer(bundles / "lenses", threads=1)
     poses = []
     for query, intrinsics in (("", None), ("?intrinsics=90,90,63.5,47.5", INTRINSICS)):
         status, found = ask(server[0], f"/localize/lenses{query}", picture.read_bytes())
         assert status == 200, found
-        np.testing.assert_allclose(found["position_m"], localiser.localise(picture, intrinsics).position_m, atol=1e-4)
+        np.testing.assert_allclose(found["position_m"], localizer.localize(picture, intrinsics).position_m, atol=1e-4)
         poses.append(found["quaternion_wxyz"])
     assert np.abs(np.subtract(*poses)).max() > 1e-3
 
@@ -206,28 +206,28 @@ def workers_of(server):
 
 @finds_workers
 def test_a_worker_that_hangs_is_replaced_and_its_picture_tried_again(bundles, frame):
-    async def localise():
+    async def localize():
         workers = Workers({"den": bundles / "den"}, 1, seconds=1.0)
         await workers.start()
         try:
             os.kill(workers_of(os.getpid())[0], signal.SIGSTOP)
-            return await workers.localise(Task("den", frame.read_bytes())), workers.replaced
+            return await workers.localize(Task("den", frame.read_bytes())), workers.replaced
         finally:
             workers.stop()
 
-    answer, replaced = asyncio.run(localise())
+    answer, replaced = asyncio.run(localize())
     assert answer["source"] == "network"
     assert replaced == 1
 
 
 def test_a_picture_that_ends_every_worker_is_given_up(bundles, frame, monkeypatch):
-    async def localise():
+    async def localize():
         workers = Workers({"den": bundles / "den"}, 1)
         await workers.start()
         monkeypatch.setattr("mambaloc.serving.workers._Worker.ask", lambda worker, task: ended(worker))
         try:
             with pytest.raises(WorkerLostError):
-                await workers.localise(Task("den", frame.read_bytes()))
+                await workers.localize(Task("den", frame.read_bytes()))
             return workers.replaced
         finally:
             workers.stop()
@@ -235,7 +235,7 @@ def test_a_picture_that_ends_every_worker_is_given_up(bundles, frame, monkeypatc
     def ended(worker):
         raise WorkerLostError
 
-    assert asyncio.run(localise()) == 3
+    assert asyncio.run(localize()) == 3
 
 
 @pytest.mark.parametrize(

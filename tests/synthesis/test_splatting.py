@@ -76,13 +76,13 @@ def test_views_do_not_depend_on_those_beside_them(walk, new_poses, new_views):
     torch.testing.assert_close(single.depth_m[0], new_views.depth_m[4], equal_nan=True, rtol=1e-5, atol=0)
 
 
-def walls(depths_m, colours, offsets_m):
+def walls(depths_m, colors, offsets_m):
     """Frames 24x32 that each look straight at one wall, moved sideways."""
     intrinsics = np.array([[30.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]])
     poses = np.tile(np.eye(4), (len(depths_m), 1, 1))
     poses[:, 0, 3] = offsets_m
     images = np.empty((len(depths_m), 3, 24, 32), np.uint8)
-    images[:] = np.array(colours)[:, None, None, None]
+    images[:] = np.array(colors)[:, None, None, None]
     depth_m = np.broadcast_to(np.array(depths_m, np.float32)[:, None, None], (len(depths_m), 24, 32)).copy()
     return PosedDepth(images, depth_m, np.repeat(intrinsics[None], len(depths_m), axis=0), poses)
 
@@ -123,7 +123,7 @@ def test_cracks_are_closed_and_steps_stay():
     torch.testing.assert_close(closed(cracked), depth_m)
 
 
-def test_holes_take_the_colours_around_them():
+def test_holes_take_the_colors_around_them():
     images = torch.full((1, 3, 13, 18), 80.0)
     known = torch.ones(1, 1, 13, 18)
     known[..., 2:11, 3:15] = 0

@@ -9,7 +9,7 @@ from mambaloc.errors import InputError
 from mambaloc.mapping import PosedFrames
 from mambaloc.mapping.building import MapSettings, build_map
 from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render
-from mambaloc.runtime.maps import MapLocaliser
+from mambaloc.runtime.maps import MapLocalizer
 from mambaloc.runtime.maps.acceptance import MOST_DEVIATION
 
 FIELDS = maps_acceptance._FIELDS
@@ -66,8 +66,8 @@ def test_evidence_of_a_room():
     images = [render(room, intrinsics, pose, size)[0] for pose in poses]
     held = np.arange(20) == 7
     key = PosedFrames([images[row] for row in np.flatnonzero(~held)], np.repeat(intrinsics[None], 19, 0), poses[~held])
-    localiser = MapLocaliser(build_map(key, MapSettings(20, 160), "room"))
-    rows = np.array(maps_acceptance._answers(localiser, images[7], intrinsics, poses[7], np.random.default_rng(0)))
+    localizer = MapLocalizer(build_map(key, MapSettings(20, 160), "room"))
+    rows = np.array(maps_acceptance._answers(localizer, images[7], intrinsics, poses[7], np.random.default_rng(0)))
     of = dict(zip(FIELDS[2:], rows.T, strict=True))
     first = of["disturbance"] == 0
     assert of["off_m"][first][0] < 0.05

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from maps_colmap import ColmapRoute, Pictures
 from maps_disturbances import DISTURBANCES, exposure, motion_blur, occlusion, smaller
-from maps_report import summarise, table, write_result
+from maps_report import summarize, table, write_result
 from maps_robustness import Answers, compare, measure, wilson_interval
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
@@ -17,7 +17,7 @@ from mambaloc.evaluation.intervals import block_resamples
 from mambaloc.mapping import PosedFrames
 from mambaloc.mapping.building import MapSettings, build_map
 from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render
-from mambaloc.runtime import Localisation
+from mambaloc.runtime import Localization
 
 SIZE = (160, 120)
 
@@ -69,9 +69,9 @@ def test_exactly_so_much_is_covered_by_grey_and_texture(share):
         assert same.sum() == round(share * 97 * 131)
         assert (dark[~same] == 0).all()
         assert (light[~same] == 255).all()
-        colours = np.unique(dark[same], axis=0)
-        assert (colours.min(axis=1) == colours.max(axis=1)).any()  # grey
-        assert len(colours) > 10  # and texture
+        colors = np.unique(dark[same], axis=0)
+        assert (colors.min(axis=1) == colors.max(axis=1)).any()  # grey
+        assert len(colors) > 10  # and texture
 
 
 @pytest.mark.parametrize("gain", [0.3, 0.1])
@@ -159,7 +159,7 @@ def test_table_says_where_both_are_worse_and_how_many_accepted_poses_are_wrong()
             "both": answers(bad, is_accepted=rule),
         },
     }
-    result = summarise(found, ["a"] * 200, {"label": "room", "unit": "m"})
+    result = summarize(found, ["a"] * 200, {"label": "room", "unit": "m"})
     lines = table(result).splitlines()
     assert lines[4].endswith("| not worse |")
     assert "worse than map: +0.22 (0.22 to 0.22) m median; worse than map: +100 (100 to 100) % wrong |" in lines[7]
@@ -183,9 +183,9 @@ class Stuck:
 
     def __init__(self, world_from_cam):
         quaternion = Rotation.from_matrix(world_from_cam[:3, :3]).as_quat()[[3, 0, 1, 2]]
-        self.answer = Localisation(world_from_cam[:3, 3], quaternion, 0.0)
+        self.answer = Localization(world_from_cam[:3, 3], quaternion, 0.0)
 
-    def localise(self, image):
+    def localize(self, image):
         return self.answer
 
 
@@ -218,17 +218,17 @@ def test_a_map_alone_is_measured(room):
         patch.setattr(maps_robustness, "DISTURBANCES", {"undisturbed": DISTURBANCES["undisturbed"]})
         found = measure(sparse_map, None, queries, [0])
     assert list(found["undisturbed"]) == ["map"]
-    assert "| undisturbed | map |" in table(summarise(found, ["walk"] * 4, {"label": "room", "unit": "m"}))
+    assert "| undisturbed | map |" in table(summarize(found, ["walk"] * 4, {"label": "room", "unit": "m"}))
 
 
-def test_colmap_localises_in_the_same_room(room, tmp_path):
+def test_colmap_localizes_in_the_same_room(room, tmp_path):
     """Its pose within 5 cm shows that pixels, cameras and poses are handed over in COLMAP's conventions."""
     key, queries = room
     shown, asked = (Pictures.write(each, SIZE[0], tmp_path / name) for each, name in ((key, "key"), (queries, "query")))
     (tmp_path / "work").mkdir()
     route = ColmapRoute(shown, tmp_path / "work")
     route.build()
-    poses = route.localise(asked)
+    poses = route.localize(asked)
     off_m = [
         np.inf if pose is None else np.linalg.norm(pose[:3, 3] - truth[:3, 3])
         for pose, truth in zip(poses, queries.world_from_cam, strict=True)
@@ -252,7 +252,7 @@ def test_report_of_several_scenes_from_a_shell(tmp_path, tool, capsys):
         about = {"label": name, "unit": "m"}
         about["network"] = {"bytes": 10 * 2**20, "preparation_cpu_s": 100.0 if name == "one" else None}
         about["map"] = {"bytes": 2**20, "preparation_cpu_s": 2.5}
-        write_result(summarise(found, ["a"] * 40, about), found, tmp_path / name)
+        write_result(summarize(found, ["a"] * 40, about), found, tmp_path / name)
     read = json.loads((tmp_path / "one/robustness.json").read_text())
     assert read["disturbances"]["undisturbed"]["ways"]["map"]["position_error_m"] is None  # JSON has no infinity
     assert np.load(tmp_path / "one/answers.npz")["undisturbed/both/position_m"].shape == (1, 40)

@@ -170,7 +170,7 @@ def test_evaluate_tool_used_wrong(words, rule, trained, tmp_path, monkeypatch, c
 
 
 @pytest.mark.slow
-def test_loaded_system_localises(trained):
+def test_loaded_system_localizes(trained):
     system = mambaloc.load(trained / "checkpoints/best.ckpt")
     assert isinstance(system, mambaloc.LitMambaLoc)
     with torch.inference_mode():

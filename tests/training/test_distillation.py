@@ -122,8 +122,8 @@ def test_each_term_can_be_switched_off(teacher, monkeypatch):
 def test_the_soft_loss_compares_positions_in_the_scenes_scale(teacher):
     system = student_of(teacher)
     system.network.head.position_scale.fit(torch.tensor([[2.0, 0, 0], [4.0, 0, 0]]))
-    normalised = system._normalised(mambaloc.types.PosePrediction(torch.tensor([[5.0, 1.0, 0]]), torch.ones(1, 4)))
-    assert normalised.position_m.tolist() == [[2.0, 1.0, 0.0]]
+    normalized = system._normalized(mambaloc.types.PosePrediction(torch.tensor([[5.0, 1.0, 0]]), torch.ones(1, 4)))
+    assert normalized.position_m.tolist() == [[2.0, 1.0, 0.0]]
 
 
 def test_the_latent_feature_is_projected_while_training_only(teacher, tmp_path):
@@ -135,7 +135,7 @@ def test_the_latent_feature_is_projected_while_training_only(teacher, tmp_path):
 # --- answers that are kept -------------------------------------------------------------------------------------------
 
 
-def test_kept_answers_are_those_of_the_centre_crops(teacher, scenes, tmp_path, monkeypatch):
+def test_kept_answers_are_those_of_the_center_crops(teacher, scenes, tmp_path, monkeypatch):
     system, asked = student_of(teacher, cache_teacher=True), []
     answer = Teacher.__call__
     monkeypatch.setattr(Teacher, "__call__", lambda self, image: asked.append(len(image)) or answer(self, image))

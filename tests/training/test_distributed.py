@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from mambaloc.cli import main
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 
 TRAIN = (sys.executable, Path(__file__).parents[2] / "tools/train.py")
 MEDIANS = ("val/position_error_m", "val/rotation_error_deg")
@@ -59,7 +59,7 @@ def test_two_processes_of_lightnings(recipe, tmp_path):
     assert done.returncode == 0, done.stderr
     assert_one_training(run, recipe, tmp_path)
     assert json.loads((run / "evaluation/best/metrics.json").read_text())["selection"].startswith("best: lowest")
-    assert Localiser(run / "model.onnx").contract.uncertainty is not None
+    assert Localizer(run / "model.onnx").contract.uncertainty is not None
 
 
 @pytest.mark.slow

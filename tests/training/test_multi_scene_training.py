@@ -17,7 +17,7 @@ from mambaloc.commands import evaluate, visualize
 from mambaloc.export import write_bundle
 from mambaloc.images import read_image
 from mambaloc.models import Checkpoint
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 from mambaloc.runtime.bundle import verify_bundle
 
 TRAIN = (sys.executable, Path(__file__).parents[2] / "tools/train.py")
@@ -88,12 +88,12 @@ def test_evaluate_measures_a_checkpoint_again(run, tmp_path, capsys):
 
 def test_the_exported_model_says_the_scene_and_the_pose_in_its_world(run, two_scenes):
     """Oracle: the predictions that the evaluation wrote, which are in the worlds, too."""
-    localiser = Localiser(run / "model.onnx")
-    assert [scene.name for scene in localiser.contract.scenes] == SCENES
+    localizer = Localizer(run / "model.onnx")
+    assert [scene.name for scene in localizer.contract.scenes] == SCENES
     for name in SCENES:
         with (run / f"evaluation/best/{name}/predictions.csv").open() as file:
             rows = list(csv.DictReader(file))
-        said = [localiser.localise(read_image(two_scenes / name / row["image"])) for row in rows]
+        said = [localizer.localize(read_image(two_scenes / name / row["image"])) for row in rows]
         assert (
             np.mean([each.scene == name for each in said])
             == read(run / f"evaluation/best/{name}/metrics.json")["recognised"]
@@ -107,7 +107,7 @@ def test_the_exported_model_says_the_scene_and_the_pose_in_its_world(run, two_sc
 
 
 def test_its_radii_are_of_frames_of_both_scenes(run):
-    contract = Localiser(run / "model.onnx").contract
+    contract = Localizer(run / "model.onnx").contract
     told = Checkpoint.read(run / "checkpoints/best.ckpt").provenance["data"]["scenes"]
     held_out = sum(each["val_frames"] for each in told.values())
     assert 0 < contract.uncertainty["held_out_frames"] <= held_out

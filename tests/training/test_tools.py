@@ -26,7 +26,7 @@ def tool(name, *words):
         runpy.run_path(str(TOOLS / f"{name}.py"), run_name="__main__")
 
 
-def test_a_run_is_exported_verified_and_localises(trained_student, scenes, tmp_path, capsys):
+def test_a_run_is_exported_verified_and_localizes(trained_student, scenes, tmp_path, capsys):
     run = shutil.copytree(trained_student, tmp_path / "run")
     tool("export", run / "checkpoints/last.ckpt", "--to", "onnx,fp16", "--raw-input")
     bundle = run / "bundle"
@@ -52,7 +52,7 @@ def test_a_released_model_is_exported_by_name(tmp_path, capsys):
     assert written == {"model.int8.onnx", "map.safetensors", "map_localiser.hpp"}
 
 
-def test_a_picture_alone_is_localised_in_the_embedded_room(tmp_path, capsys):
+def test_a_picture_alone_is_localized_in_the_embedded_room(tmp_path, capsys):
     tool("localize", embedded_shot(tmp_path), "--out", tmp_path / "poses.tum")
     assert "1 poses (1 from the map, 0 from the network) in embedded/room" in capsys.readouterr().out
     (row,) = np.loadtxt(tmp_path / "poses.tum", ndmin=2)

@@ -22,7 +22,7 @@ def test_cumulative_curve_is_the_empirical_distribution(axes):
     assert most_shown([errors, errors / 2]) == pytest.approx(np.percentile(errors, 95))
 
 
-def test_each_training_is_a_line_and_each_system_a_colour(axes):
+def test_each_training_is_a_line_and_each_system_a_color(axes):
     plot_errors_by_time(axes, {"a": [([1, 2], [0.5, 0.4]), ([1, 3], [0.6, 0.3])], "b": [([2], [0.7])]})
     first, second, other = axes.lines
     np.testing.assert_array_equal(second.get_data(), [[1, 3], [0.6, 0.3]])

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
 from mambaloc.rendering import default_intrinsics, embedded_walk
-from mambaloc.runtime.localisation import Localisation
+from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.world import World
 from mambaloc.viz.rerun_recording import rerun_recording
 
@@ -87,7 +87,7 @@ def recording(poses, pictures, tmp_path_factory):
             estimate = estimated_m, turned.as_quat(scalar_first=True, canonical=True)
             if row == LOST:
                 estimate = np.full(3, np.nan), np.full(4, np.nan)
-            found = Localisation(*estimate, 0.0, **more[row])
+            found = Localization(*estimate, 0.0, **more[row])
             when = FIRST + np.timedelta64(row, "s")
             truth = OFFSET_M + pose[:3, 3], quaternion(pose)
             writing.add_frame(pictures[row], found, when, K if row < 3 else None, truth)
@@ -167,7 +167,7 @@ def test_it_opens_with_a_layout(recording):
 def test_an_error_leaves_no_file(pictures, tmp_path):
     def broken():
         with rerun_recording(tmp_path / "a.rrd", "den") as writing:
-            writing.add_frame(pictures[0], Localisation(np.zeros(3), np.array([1.0, 0, 0, 0]), 0.0), 0.0)
+            writing.add_frame(pictures[0], Localization(np.zeros(3), np.array([1.0, 0, 0, 0]), 0.0), 0.0)
             raise InputError("broken")
 
     with pytest.raises(InputError, match="broken"):

@@ -6,8 +6,8 @@ import pytest
 
 import mambaloc
 from mambaloc.data import PoseDataModule
-from mambaloc.evaluation.predict import localise_test_frames
-from mambaloc.metrics import summarise
+from mambaloc.evaluation.predict import localize_test_frames
+from mambaloc.metrics import summarize
 from mambaloc.zoo import Manifest, list_released
 
 ZOO = Path(__file__).parents[2] / "zoo"
@@ -32,8 +32,8 @@ def test_their_figures_are_found_again(name):
     (result,) = manifest.results
     assert result.data == manifest.scene == "embedded/room"
     data = PoseDataModule("embedded", image_size=system.image_size, short_side=manifest.short_side)
-    table = localise_test_frames(system, data, "cpu")
+    table = localize_test_frames(system, data, "cpu")
     assert len(table.index) == result.n
-    found = summarise(table)
+    found = summarize(table)
     assert found["position_error_m"] == pytest.approx(result.position_error_m, abs=2e-3)
     assert found["rotation_error_deg"] == pytest.approx(result.rotation_error_deg, abs=0.05)

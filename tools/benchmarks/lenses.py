@@ -19,7 +19,7 @@ from mambaloc.images import Image
 from mambaloc.rendering import default_intrinsics, embedded_room, render, sensor
 from mambaloc.rendering.scenes.embedded import embedded_shots
 from mambaloc.rendering.scenes.shots import Shot
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
 LENSES = {  # focal length over the training camera's, and (width, height) in pixels
@@ -34,13 +34,13 @@ LENSES = {  # focal length over the training camera's, and (width, height) in pi
 
 @exits_cleanly
 def main() -> None:
-    """Localise and print."""
+    """Localize and print."""
     parser = OptionParser(description=__doc__)
     parser.add_argument("model", metavar="MODEL")
     parser.add_argument("--every", type=whole_number(1), default=1, help="of the test views, every so many-th")
     args = parser.parse_args()
-    localiser = Localiser(args.model, 1, sparse_map=False)
-    if localiser.contract is None or localiser.contract.intrinsics is None:
+    localizer = Localizer(args.model, 1, sparse_map=False)
+    if localizer.contract is None or localizer.contract.intrinsics is None:
         raise InputError(f"{args.model}: takes no intrinsics. Give a model that does, such as DenseLoc's.")
     shots = [shot for shot in embedded_shots() if shot.split == "test"][:: args.every]
     print(provenance.machine())
@@ -49,7 +49,7 @@ def main() -> None:
     )
     training: NDArray[np.float64] | None = None
     for name in LENSES:
-        stated, unstated = lens_errors(localiser, shots, name)
+        stated, unstated = lens_errors(localizer, shots, name)
         median, mean = np.median(stated, axis=0), stated.mean(axis=0)
         training = median if training is None else training
         ratio_m, ratio_deg = median / training
@@ -63,7 +63,7 @@ def in_words(error: NDArray[np.float64]) -> str:
 
 
 def lens_errors(
-    localiser: Localiser, shots: Sequence[Shot], name: str
+    localizer: Localizer, shots: Sequence[Shot], name: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Errors (N, 2) in metres and degrees with the camera stated, and without; None where it must be."""
     zoom, size = LENSES[name]
@@ -72,17 +72,17 @@ def lens_errors(
     room, stated, unstated = embedded_room(), [], []
     for number, shot in enumerate(shots):
         rgb = sensor(render(room, intrinsics, shot.world_from_cam, size)[0], np.random.default_rng(number))
-        stated.append(error(localiser, rgb, intrinsics, shot))
+        stated.append(error(localizer, rgb, intrinsics, shot))
         try:
-            unstated.append(error(localiser, rgb, None, shot))
+            unstated.append(error(localizer, rgb, None, shot))
         except InputError:  # too narrow
             continue
     return np.array(stated), np.array(unstated) if unstated else None
 
 
-def error(localiser: Localiser, rgb: Image, intrinsics: ArrayLike | None, shot: Shot) -> tuple[float, float]:
+def error(localizer: Localizer, rgb: Image, intrinsics: ArrayLike | None, shot: Shot) -> tuple[float, float]:
     """Of one view, in metres and degrees."""
-    found = localiser.localise(rgb, intrinsics)
+    found = localizer.localize(rgb, intrinsics)
     off_m = float(np.linalg.norm(found.position_m - shot.world_from_cam[:3, 3]))
     return off_m, float(rotation_error_deg(found.quaternion, quaternion_from_matrix(shot.world_from_cam[:3, :3])))
 

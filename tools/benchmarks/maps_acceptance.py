@@ -22,7 +22,7 @@ from mambaloc.images import Image, read_image
 from mambaloc.mapping.building import MapSettings
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
-from mambaloc.runtime.maps import CameraPose, MapLocalisation, MapLocaliser
+from mambaloc.runtime.maps import CameraPose, MapLocalization, MapLocalizer
 from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, MOST_DEVIATION, Evidence
 from mambaloc.runtime.maps.features import rescaled_intrinsics
 from mambaloc.runtime.maps.viewpoints import spread_m
@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 
 
 def collect_evidence(recipe: MapRecipe, queries: int, out: Path) -> None:
-    """Hold out each sequence of the training frames in turn, and localise its frames, disturbed, in a map of the rest.
+    """Hold out each sequence of the training frames in turn, and localize its frames, disturbed, in a map of the rest.
 
     Args:
         recipe: scene and settings of the maps.
@@ -57,37 +57,37 @@ def collect_evidence(recipe: MapRecipe, queries: int, out: Path) -> None:
     for fold, name in enumerate(sequences):
         train, held = key_and_query(recipe, name)
         sparse_map, _ = timed_map(train, recipe)
-        localiser = MapLocaliser(sparse_map)
+        localizer = MapLocalizer(sparse_map)
         chosen = np.unique(np.linspace(0, len(held) - 1, queries).round().astype(int))
         for row in progress(chosen, name, len(chosen)):
             image = held.images[row]
             rgb = read_image(image) if isinstance(image, Path) else image
             shot = (rgb, held.intrinsics[row], held.world_from_cam[row])
-            rows += [(fold, row, *answer) for answer in _answers(localiser, *shot, np.random.default_rng((fold, row)))]
+            rows += [(fold, row, *answer) for answer in _answers(localizer, *shot, np.random.default_rng((fold, row)))]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(out / EVIDENCE_FILE, rows=np.array(rows, np.float64))
 
 
 def _answers(
-    localiser: MapLocaliser, rgb: Image, intrinsics: Floats, truth: Floats, rng: np.random.Generator
+    localizer: MapLocalizer, rgb: Image, intrinsics: Floats, truth: Floats, rng: np.random.Generator
 ) -> list[tuple[float, ...]]:
     """Without a prior, and, where that is not accepted, with one that is near the truth."""
-    near_m = _PRIOR[0] * spread_m(localiser.map.key_poses)
+    near_m = _PRIOR[0] * spread_m(localizer.map.key_poses)
     turn = cv2.Rodrigues(np.radians(rng.normal(0, _PRIOR[1], 3)))[0]
     prior = CameraPose(turn @ truth[:3, :3], truth[:3, 3] + rng.normal(0, near_m, 3))
     found = []
     for count, (number, picture, scale) in enumerate(_pictures(rgb, rng)):
         matrix = rescaled_intrinsics(intrinsics, (rgb.shape[1], rgb.shape[0]), (picture.shape[1], picture.shape[0]))
-        features = localiser.features(picture, np.diag((scale, scale, 1)) @ matrix + _centred(matrix, scale))
-        alone = localiser.localise_features(features)
-        answers = [alone] if alone.is_accepted else [alone, localiser.localise_features(features, prior)]
+        features = localizer.features(picture, np.diag((scale, scale, 1)) @ matrix + _centered(matrix, scale))
+        alone = localizer.localize_features(features)
+        answers = [alone] if alone.is_accepted else [alone, localizer.localize_features(features, prior)]
         distinct = {answer.evidence: answer for answer in answers if answer.evidence is not None}
         found += [(count, number, *_scores(answer, evidence, truth)) for evidence, answer in distinct.items()]
     return found
 
 
-def _centred(matrix: Floats, scale: float) -> Floats:
+def _centered(matrix: Floats, scale: float) -> Floats:
     """What keeps the centre where it is once the focal length is scaled."""
     kept = np.zeros((3, 3))
     kept[:2, 2] = (1 - scale) * matrix[:2, 2]
@@ -114,7 +114,7 @@ def _drawn(rgb: Image, rng: np.random.Generator) -> Image:
     return rgb
 
 
-def _scores(answer: MapLocalisation, evidence: Evidence, truth: Floats) -> tuple[float, ...]:
+def _scores(answer: MapLocalization, evidence: Evidence, truth: Floats) -> tuple[float, ...]:
     """The last columns of ``_FIELDS``."""
     rotation = matrix_from_quaternion(answer.quaternion)
     off = np.concatenate((truth[:3, 3] - answer.position_m, cv2.Rodrigues(truth[:3, :3] @ rotation.T)[0][:, 0]))

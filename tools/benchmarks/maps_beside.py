@@ -24,7 +24,7 @@ from mambaloc.files import whole_file, writing
 from mambaloc.images import read_image
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.recipe import MapRecipe
-from mambaloc.runtime.maps import MAP_FILE, MapLocaliser
+from mambaloc.runtime.maps import MAP_FILE, MapLocalizer
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
 Floats = NDArray[np.float64]
@@ -102,10 +102,10 @@ def _ours(key: Pictures, queries: Pictures, recipe: MapRecipe, seed: int, out: P
     settings = replace(recipe.settings, key_frames=len(key))
     sparse_map, build_cpu_s = timed_map(key.frames, replace(recipe, settings=settings))
     sparse_map.save(out / MAP_FILE)
-    localiser, scores = MapLocaliser(sparse_map, seed), []
+    localizer, scores = MapLocalizer(sparse_map, seed), []
     for name, truth in zip(queries.names, queries.world_from_cam, strict=True):
         start = time.process_time()
-        found = localiser.localise(read_image(queries.folder / name), queries.intrinsics)  # theirs reads the file, too
+        found = localizer.localize(read_image(queries.folder / name), queries.intrinsics)  # theirs reads the file, too
         scores.append(score(found, found.is_accepted, time.process_time() - start, truth))
     return Turn(scores, build_cpu_s, (out / MAP_FILE).stat().st_size, len(sparse_map))
 
@@ -115,7 +115,7 @@ def _theirs(key: Pictures, queries: Pictures, work: Path, seed: int) -> Turn:
     route, start = ColmapRoute(key, work, seed), time.process_time()
     route.build()
     build_cpu_s, start = time.process_time() - start, time.process_time()
-    poses = route.localise(queries)
+    poses = route.localize(queries)
     each_s = (time.process_time() - start) / len(queries)
     scores = [_score(pose, each_s, truth) for pose, truth in zip(poses, queries.world_from_cam, strict=True)]
     return Turn(scores, build_cpu_s, route.bytes(), int(route.model.num_points3D()))

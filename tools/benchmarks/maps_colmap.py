@@ -66,7 +66,7 @@ class Pictures:
 
 @dataclass
 class ColmapRoute:
-    """A model of key frames, and queries localised in it.
+    """A model of key frames, and queries localized in it.
 
     Args:
         key: the key frames.
@@ -94,9 +94,9 @@ class ColmapRoute:
     def camera(self, number: int) -> Any:
         """The camera in COLMAP's pixels, which count from the corner."""
         focal_x, focal_y = np.diag(self.key.intrinsics)[:2]
-        centre = self.key.intrinsics[:2, 2] + CORNER_PX
+        center = self.key.intrinsics[:2, 2] + CORNER_PX
         width, height = self.key.size
-        params = (focal_x, focal_y, *centre)
+        params = (focal_x, focal_y, *center)
         return self.colmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
 
     def find_features(self, pictures: Pictures) -> None:
@@ -153,8 +153,8 @@ class ColmapRoute:
         model = sum(path.stat().st_size for path in (self.work / "model").iterdir())
         return model + descriptors + 2 * (self.words.size + self.index.size)
 
-    def localise(self, queries: Pictures) -> list[Floats | None]:
-        """Localise queries, all of each step together: ``world_from_cam`` (4, 4), or None, of each."""
+    def localize(self, queries: Pictures) -> list[Floats | None]:
+        """Localize queries, all of each step together: ``world_from_cam`` (4, 4), or None, of each."""
         self.find_features(queries)
         with self.colmap.Database.open(self.database) as database:
             numbers = [database.read_image_with_name(name).image_id for name in queries.names]

@@ -33,7 +33,7 @@ _COLUMNS = (
 _METRICS = {"position_error_m": "m median", "rotation_error_deg": "° median", "wrong": "% wrong"}
 
 
-def summarise(
+def summarize(
     found: Mapping[str, Mapping[str, Answers]], sequences: Sequence[str], about: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Figures of each disturbance and way, how both compare with each alone, and where they come from.

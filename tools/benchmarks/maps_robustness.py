@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from mambaloc.console import progress
 from mambaloc.images import read_image
 from mambaloc.mapping.building import PosedFrames
-from mambaloc.runtime import Localiser
-from mambaloc.runtime.localisation import combined
-from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.runtime import Localizer
+from mambaloc.runtime.localization import combined
+from mambaloc.runtime.maps import CameraPose, MapLocalizer, SparseMap
 from mambaloc.runtime.maps.features import rescaled_intrinsics
 from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
@@ -32,7 +32,7 @@ _Z = 1.959964  # of a 95 % interval
 
 @dataclass(frozen=True)
 class Answers:
-    """How one way localised frames, a row a RANSAC seed; a network has one row.
+    """How one way localized frames, a row a RANSAC seed; a network has one row.
 
     Shape:
         all (S, N); errors are infinite where there was no pose.
@@ -83,20 +83,20 @@ class Answers:
 
 
 def measure(
-    sparse_map: SparseMap, network: Localiser | None, frames: PosedFrames, seeds: Sequence[int]
+    sparse_map: SparseMap, network: Localizer | None, frames: PosedFrames, seeds: Sequence[int]
 ) -> dict[str, dict[str, Answers]]:
-    """Localise frames under every disturbance, by each way.
+    """Localize frames under every disturbance, by each way.
 
     Args:
         sparse_map: the map.
         network: an exported model of the same scene; without one, only the map is measured.
         frames: with their true poses.
-        seeds: of RANSAC; each frame is localised once with each.
+        seeds: of RANSAC; each frame is localized once with each.
 
     Returns:
         By disturbance, then by way: ``map``, and with a network ``network`` and ``both``.
     """
-    localisers = [MapLocaliser(sparse_map, seed) for seed in seeds]
+    localizers = [MapLocalizer(sparse_map, seed) for seed in seeds]
     found = {}
     for number, (name, disturb) in enumerate(DISTURBANCES.items()):
         rows: dict[str, list[Floats]] = {}
@@ -106,28 +106,28 @@ def measure(
             picture = disturb(rgb, np.random.default_rng((number, row)))
             sizes = ((each.shape[1], each.shape[0]) for each in (rgb, picture))
             matrix = rescaled_intrinsics(intrinsics, *sizes)
-            for way, answers in _localise(localisers, network, picture, matrix).items():
+            for way, answers in _localize(localizers, network, picture, matrix).items():
                 scores = [score(answer, is_accepted, cpu_s, truth) for answer, is_accepted, cpu_s in answers]
                 rows.setdefault(way, []).append(np.array(scores))
         found[name] = {way: Answers.of(np.stack(each, axis=1)) for way, each in rows.items()}
     return found
 
 
-def _localise(
-    localisers: Sequence[MapLocaliser], network: Localiser | None, picture: Any, intrinsics: Floats
+def _localize(
+    localizers: Sequence[MapLocalizer], network: Localizer | None, picture: Any, intrinsics: Floats
 ) -> dict[str, list[tuple[Found, bool, float]]]:
     """Each way's answers, whether they are accepted, and what they took; an answer a seed, of a network one."""
     found: dict[str, list[tuple[Found, bool, float]]] = {}
     guess, network_s, prior = None, 0.0, None
     if network:
-        guess, network_s = _timed(network.localise, picture)
+        guess, network_s = _timed(network.localize, picture)
         prior = CameraPose.from_quaternion(guess.quaternion, guess.position_m)
         found["network"] = [(guess, False, network_s)]
-    for localiser in localisers:
-        alone, alone_s = _timed(localiser.localise, picture, intrinsics)
+    for localizer in localizers:
+        alone, alone_s = _timed(localizer.localize, picture, intrinsics)
         found.setdefault("map", []).append((alone, alone.is_accepted, alone_s))
         if guess:
-            guided, guided_s = _timed(localiser.localise, picture, intrinsics, prior)
+            guided, guided_s = _timed(localizer.localize, picture, intrinsics, prior)
             both = combined(guess, guided)
             found.setdefault("both", []).append((both, both.is_accepted, network_s + guided_s))
     return found

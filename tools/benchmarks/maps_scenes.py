@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from maps_report import summarise, table, write_result
+from maps_report import summarize, table, write_result
 from maps_robustness import measure
 
 from mambaloc.errors import InputError
@@ -19,7 +19,7 @@ from mambaloc.mapping.building import PosedFrames, build_map
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.models import Checkpoint
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 from mambaloc.runtime.maps import MAP_FILE, SparseMap
 
 
@@ -69,17 +69,17 @@ def measure_robustness(
         },
         "network": about_network,
     }
-    result = summarise(found, [str(sequence_of(image)) for image in queries.images], about)
+    result = summarize(found, [str(sequence_of(image)) for image in queries.images], about)
     write_result(result, found, out)
     return table(result)
 
 
 def key_and_query(recipe: MapRecipe, hold_out: str | None) -> tuple[PosedFrames, PosedFrames]:
-    """Frames to build from and frames to localise: training and test frames, or of the training frames alone.
+    """Frames to build from and frames to localize: training and test frames, or of the training frames alone.
 
     Args:
         recipe: names the scene.
-        hold_out: name of the folder of a sequence; its frames are localised, and the map is built from the others. To
+        hold_out: name of the folder of a sequence; its frames are localized, and the map is built from the others. To
             decide anything, so that test frames are left for the end.
 
     Raises:
@@ -107,7 +107,7 @@ def timed_map(train: PosedFrames, recipe: MapRecipe) -> tuple[SparseMap, float]:
     return sparse_map, time.process_time() - start
 
 
-def _network(path: Path, training_cpu_s: float | None, onnx: Path) -> tuple[Localiser, dict[str, Any]]:
+def _network(path: Path, training_cpu_s: float | None, onnx: Path) -> tuple[Localizer, dict[str, Any]]:
     """Export a checkpoint, for one thread; and what it is."""
     checkpoint = Checkpoint.read(path)
     system = checkpoint.system()
@@ -119,4 +119,4 @@ def _network(path: Path, training_cpu_s: float | None, onnx: Path) -> tuple[Loca
         "preparation_cpu_s": training_cpu_s,
         "training": checkpoint.describe(),
     }
-    return Localiser(onnx, threads=1, sparse_map=False), about
+    return Localizer(onnx, threads=1, sparse_map=False), about

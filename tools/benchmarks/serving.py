@@ -1,4 +1,4 @@
-"""Load a server of poses with hey, and compare it with a plain loop over Localiser.localise in the same run.
+"""Load a server of poses with hey, and compare it with a plain loop over Localizer.localize in the same run.
 
 python tools/benchmarks/serving.py BUNDLE PICTURE [--requests 100000] [--kills 20]
 
@@ -31,7 +31,7 @@ from mambaloc.benchmark.footprint import said_of
 from mambaloc.console import OptionParser, exits_cleanly, whole_number
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
-from mambaloc.runtime import Localiser
+from mambaloc.runtime import Localizer
 
 CLIENTS = (1, 16)
 _SECONDS = 10
@@ -70,7 +70,7 @@ def main() -> None:
     print(provenance.machine())
     for threads in (1, None):
         each = "1 thread" if threads else "ONNX Runtime's own threads"
-        print(f"a loop over Localiser.localise, {each}: {loop_per_second(args.bundle, args.picture, threads):.1f}/s")
+        print(f"a loop over Localizer.localize, {each}: {loop_per_second(args.bundle, args.picture, threads):.1f}/s")
     with served(args.bundle, args.workers) as (server, url):
         for clients in CLIENTS:
             load = under_load(url, args.picture, clients, seconds=_SECONDS)
@@ -84,15 +84,15 @@ def main() -> None:
 
 
 def loop_per_second(bundle: Path, picture: Path, threads: int | None) -> float:
-    """Pictures that a loop decodes and localises in a second."""
-    localiser, data = Localiser(bundle, threads), picture.read_bytes()
+    """Pictures that a loop decodes and localizes in a second."""
+    localizer, data = Localizer(bundle, threads), picture.read_bytes()
     counts: list[float] = []
     began = time.perf_counter()
     while time.perf_counter() - began < _SECONDS / 2:
         image = decode_image(data)
         if isinstance(image, str):
             raise InputError(f"{picture}: {image}. Give another.")
-        localiser.localise(image)
+        localizer.localize(image)
         counts.append(time.perf_counter())
     half = counts[len(counts) // 5 :]  # once everything is warm
     return (len(half) - 1) / (half[-1] - half[0])

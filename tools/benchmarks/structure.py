@@ -110,8 +110,8 @@ def _describe(model: Any, world_from_cam: Floats) -> str:
     placed = [image for image in model.images.values() if image.has_pose]
     true = world_from_cam[[int(Path(image.name).stem) for image in placed]]
     found = [image.cam_from_world().inverse() for image in placed]
-    centres = np.array([pose.translation for pose in found])
-    apart, true_apart = centres - centres.mean(axis=0), true[:, :3, 3] - true[:, :3, 3].mean(axis=0)
+    centers = np.array([pose.translation for pose in found])
+    apart, true_apart = centers - centers.mean(axis=0), true[:, :3, 3] - true[:, :3, 3].mean(axis=0)
     rotation, _ = Rotation.align_vectors(true_apart, apart)
     turned = rotation.apply(apart)
     scale = (turned * true_apart).sum() / (turned**2).sum()

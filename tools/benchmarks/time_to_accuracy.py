@@ -52,7 +52,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Way:
-    """One way to a localiser.
+    """One way to a localizer.
 
     Args:
         name: of it.
@@ -153,7 +153,7 @@ def way_of_training(name: str, started: float, clock: dict[str, Any]) -> Way:
 
 
 def measure_maps(recipe: MapRecipe) -> list[Way]:
-    """Build a recipe's map, then pycolmap's of the same key frames at the same size, and localise the test frames."""
+    """Build a recipe's map, then pycolmap's of the same key frames at the same size, and localize the test frames."""
     frames = f"{recipe.settings.key_frames} key frames"
     with TemporaryDirectory() as work:
         return [
@@ -179,7 +179,7 @@ def _colmap(recipe: MapRecipe, work: Path, started: float) -> tuple[float, tuple
     built_s = time.time() - started
     shown = Pictures.write(queries, recipe.settings.width, work / "query")
     scores = [
-        errors_of_pose(pose, truth) for pose, truth in zip(route.localise(shown), shown.world_from_cam, strict=True)
+        errors_of_pose(pose, truth) for pose, truth in zip(route.localize(shown), shown.world_from_cam, strict=True)
     ]
     return built_s, ((built_s, _medians(*np.transpose(scores))),)
 

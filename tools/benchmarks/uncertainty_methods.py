@@ -179,15 +179,15 @@ def told_apart(score: Tensor, elsewhere: Tensor) -> float:
 def _by_spread(
     network: PoseNetwork, networks: list[PoseNetwork], size: tuple[int, int], test: Pictures, there: Pictures
 ) -> list[Way]:
-    """Ways that localise an image several times, and take how far apart the poses are."""
+    """Ways that localize an image several times, and take how far apart the poses are."""
     told: dict[str, tuple[int, Callable[[Frames], list[PosePrediction]]]] = {
         "dropout": (PASSES, lambda frames: _dropped_out(network, frames, size)),
-        "shifted crops": (5, lambda frames: [_localised(network, frames, size, place) for place in _PLACES]),
+        "shifted crops": (5, lambda frames: [_localized(network, frames, size, place) for place in _PLACES]),
     }
     if len(networks) > 1:
         told[f"ensemble of {len(networks)}"] = (
             len(networks),
-            lambda frames: [_localised(each, frames, size) for each in networks],
+            lambda frames: [_localized(each, frames, size) for each in networks],
         )
     ways = [
         Way(name, passes, *_spreads(poses, test), _spreads(poses, there)[0]) for name, (passes, poses) in told.items()
@@ -198,10 +198,10 @@ def _by_spread(
     return [Way("cells", 1, position, rotation, _disagreement(network, size, there)[0]), *ways]
 
 
-def _localised(
+def _localized(
     network: PoseNetwork, frames: Frames, size: tuple[int, int], place: tuple[float, float] = (0.5, 0.5)
 ) -> PosePrediction:
-    """Localise a crop of each frame; ``place`` is 0 at the top or left and 1 at the bottom or right."""
+    """Localize a crop of each frame; ``place`` is 0 at the top or left and 1 at the bottom or right."""
     image, intrinsics = frames
     corner = [int((side - crop) * at) for side, crop, at in zip(image.shape[-2:], size, place, strict=True)]
     crop = image[..., corner[0] : corner[0] + size[0], corner[1] : corner[1] + size[1]].float() / 255
@@ -213,7 +213,7 @@ def _disagreement(network: PoseNetwork, size: tuple[int, int], pictures: Picture
     """How far a dense head's cells are from the pose solved of them, in metres and degrees; (N,) each."""
     position, rotation = [torch.zeros(0)], [torch.zeros(0)]
     for frames in pictures():
-        prediction = _localised(network, frames, size)
+        prediction = _localized(network, frames, size)
         if (cells := prediction.cells) is None:
             return position[0], rotation[0]
         apart_m = position_error_m(cells.position_m, prediction.position_m[:, None])
@@ -252,7 +252,7 @@ def _dropped_out(network: PoseNetwork, frames: Frames, size: tuple[int, int]) ->
             module.train()
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            return [_localised(network, frames, size) for _ in range(PASSES)]
+            return [_localized(network, frames, size) for _ in range(PASSES)]
     finally:
         network.eval()
 

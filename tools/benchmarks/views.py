@@ -23,7 +23,7 @@ from mambaloc.images import read_image, resized
 from mambaloc.mapping import PosedFrames
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
-from mambaloc.runtime.maps import CameraPose, MapLocaliser, SparseMap
+from mambaloc.runtime.maps import CameraPose, MapLocalizer, SparseMap
 from mambaloc.synthesis import (
     PlaneSweep,
     PosedDepth,
@@ -68,7 +68,7 @@ def main() -> None:
 
 def adjusted(frames: PosedFrames, sparse_map: SparseMap) -> PosedFrames:
     """Frames with the poses and the focal length of a map, as its pictures have them."""
-    drift = MapLocaliser(sparse_map).drift
+    drift = MapLocalizer(sparse_map).drift
     poses = [drift.to_adjusted(CameraPose(pose[:3, :3], pose[:3, 3])).matrix for pose in frames.world_from_cam]
     scale = np.array([[sparse_map.lens.focal, 1, 1], [1, sparse_map.lens.focal, 1], [1, 1, 1]])
     return PosedFrames(frames.images, frames.intrinsics * scale, np.stack(poses))

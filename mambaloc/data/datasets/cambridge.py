@@ -127,12 +127,12 @@ def _archive(scene: str, handle: int, bitstream: str) -> Archive:
     )
 
 
-# The addresses are those that public localisation code downloads from; they were not tried from here. The university
+# The addresses are those that public localization code downloads from; they were not tried from here. The university
 # publishes neither size nor checksum that we know of; the licence is quoted from the record of King's College.
 SOURCE = Source(
     name="cambridge",
     title="Cambridge Landmarks",
-    page="http://mi.eng.cam.ac.uk/projects/relocalisation/",
+    page="http://mi.eng.cam.ac.uk/projects/relocalization/",
     licence="CC BY-NC-SA 2.0 UK",
     terms="non-commercial, credit the authors, share alike",
     splits=tuple(_SPLIT_FILES.values()),

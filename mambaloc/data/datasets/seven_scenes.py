@@ -130,7 +130,7 @@ def _archive(scene: str, size_bytes: int, sha256: str) -> Archive:
     return Archive((f"https://{folder}/{scene}.zip", f"http://{folder}/{scene}.zip"), size_bytes, sha256)
 
 
-# The addresses are those that public localisation code downloads from; they were not tried from here. The exact licence
+# The addresses are those that public localization code downloads from; they were not tried from here. The exact licence
 # text is on the project page only.
 SOURCE = Source(
     name="7scenes",

@@ -24,7 +24,7 @@ def read_nvm_points(folder: Path, frames: Frames, count: int, seed: int) -> Scen
     known = [*seen]
     model = Reconstruction(
         np.array([rows[cameras.names[camera]] for camera in known], int),
-        cameras.centre_m[known],
+        cameras.center_m[known],
         canonical(conjugate(cameras.cam_from_world[known])),
         [np.array(points).reshape(-1, 3) for points in seen.values()],
     )

@@ -1,6 +1,6 @@
 /** What the contract says of the model, for people. */
 
-import { modelOf } from "./localiser.js";
+import { modelOf } from "./localizer.js";
 
 /**
  * Fill the list under "About this model".

@@ -204,14 +204,14 @@ async function startCamera(turn) {
   startStream();
 }
 
-/** Localise frame after frame. `frameAt` gives the number of a frame whose true pose is known. */
+/** Localize frame after frame. `frameAt` gives the number of a frame whose true pose is known. */
 function startStream(frameAt = null) {
   const turn = visit;
   stream = new Stream($("video"), async (bitmap, seconds) => {
     try {
       const frame = frameAt?.(seconds);
       const truth = frameAt && poseOf(film.poses[frame]);
-      const pose = await localise(bitmap, truth, statedCamera(source, bitmap));
+      const pose = await localize(bitmap, truth, statedCamera(source, bitmap));
       if (turn !== visit) return;
       if (truth) readout.showError(pose, truth, frame);
       readout.show(pose, source);
@@ -223,11 +223,11 @@ function startStream(frameAt = null) {
 }
 
 /**
- * Localise one picture and show where it was taken; null if another source was chosen meanwhile.
+ * Localize one picture and show where it was taken; null if another source was chosen meanwhile.
  * @param truth pose, where that is known.
  * @param {number[][]|null} intrinsics of the picture; the training camera's unless given.
  */
-async function localise(bitmap, truth = null, intrinsics = null) {
+async function localize(bitmap, truth = null, intrinsics = null) {
   const turn = visit;
   try {
     view?.setPicture(bitmap, bitmap.width, bitmap.height);
@@ -236,7 +236,7 @@ async function localise(bitmap, truth = null, intrinsics = null) {
     bitmap.close();
     throw error;
   }
-  const pose = await engine.localise(bitmap, intrinsics);
+  const pose = await engine.localize(bitmap, intrinsics);
   if (turn === visit) {
     $("error").hidden = true;
     drawMatches($("matches"), pose.source === "map" ? pose.map.matches : []);
@@ -245,8 +245,8 @@ async function localise(bitmap, truth = null, intrinsics = null) {
   return pose;
 }
 
-/** Localise a picture that does not move. */
-async function localiseStill(blob, name, frame = null) {
+/** Localize a picture that does not move. */
+async function localizeStill(blob, name, frame = null) {
   const turn = visit;
   try {
     const bitmap = await decoded(blob, name);
@@ -258,12 +258,12 @@ async function localiseStill(blob, name, frame = null) {
     const [width, height] = [bitmap.width, bitmap.height].map((side) => Math.max(1, Math.round(side * shrunk)));
     const canvas = Object.assign($("still"), { width, height, hidden: false });
     canvas.getContext("2d").drawImage(bitmap, 0, 0, width, height);
-    const pose = await localise(bitmap, null, frame ? frame.intrinsics : statedCamera(source, bitmap));
+    const pose = await localize(bitmap, null, frame ? frame.intrinsics : statedCamera(source, bitmap));
     if (turn !== visit) return null;
     if (frame) readout.showDeviation(deviations(pose, frame, contract).at(-1));
     else readout.forgetErrors();
     readout.show(pose, source, frame?.file);
-    setState("ready", "Localised");
+    setState("ready", "Localized");
     return pose;
   } catch (error) {
     if (turn === visit) fail(error);
@@ -275,7 +275,7 @@ async function takeFile(file) {
   if (!file || !engine) return;
   photo = file;
   if (source !== "photo") await choose("photo");
-  await localiseStill(file, file.name);
+  await localizeStill(file, file.name);
 }
 
 async function takeFrame(frame) {
@@ -283,7 +283,7 @@ async function takeFrame(frame) {
   const response = await fetch(`bundle/${frame.file}`).catch(() => null);
   const blob = response?.ok ? await response.blob().catch(() => null) : null;
   if (turn !== visit) return null;
-  if (blob) return localiseStill(blob, frame.file, frame);
+  if (blob) return localizeStill(blob, frame.file, frame);
   fail(new Error(`${frame.file} cannot be fetched; is the server still running?`));
   return null;
 }

@@ -38,14 +38,14 @@ export class Engine {
   }
 
   /**
-   * Localise a bitmap, which the worker takes.
+   * Localize a bitmap, which the worker takes.
    * @param {number[][]|null} intrinsics of it; the training camera's unless given.
    */
-  localise(bitmap, intrinsics = null) {
+  localize(bitmap, intrinsics = null) {
     const id = (this.#count += 1);
     return new Promise((resolve, reject) => {
       this.#waiting.set(id, { resolve, reject });
-      this.#worker.postMessage({ type: "localise", id, bitmap, intrinsics }, [bitmap]);
+      this.#worker.postMessage({ type: "localize", id, bitmap, intrinsics }, [bitmap]);
     });
   }
 

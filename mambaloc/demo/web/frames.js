@@ -1,6 +1,6 @@
 /** The bundle's test frames: does this browser find the poses that Python found? */
 
-import { deviation, modelOf } from "./localiser.js";
+import { deviation, modelOf } from "./localizer.js";
 import { small } from "./readout.js";
 
 /**
@@ -21,25 +21,25 @@ export class TestFrames {
   #list;
   #verdict;
   #contract;
-  #localise;
+  #localize;
 
   /**
    * @param {HTMLElement} list to fill with a button for each frame.
    * @param {HTMLElement} verdict on all of them.
    * @param {object} contract of the bundle.
-   * @param {(frame: object) => Promise<object|null>} localise one of the contract's frames; null if that failed.
+   * @param {(frame: object) => Promise<object|null>} localize one of the contract's frames; null if that failed.
    */
-  constructor(list, verdict, contract, localise) {
+  constructor(list, verdict, contract, localize) {
     this.#list = list;
     this.#verdict = verdict;
     this.#contract = contract;
-    this.#localise = localise;
+    this.#localize = localize;
     list.replaceChildren(...contract.frames.map((frame, i) => this.#button(frame, i)));
     verdict.textContent = "Does this browser find what Python found?";
     delete verdict.dataset.within;
   }
 
-  /** Localise every frame, and say how far the worst is from Python's pose. */
+  /** Localize every frame, and say how far the worst is from Python's pose. */
   async checkAll() {
     const found = [];
     for (const frame of this.#contract.frames) {
@@ -64,7 +64,7 @@ export class TestFrames {
     for (const button of this.#list.children) {
       button.setAttribute("aria-pressed", String(button.dataset.frameFile === frame.file));
     }
-    const pose = await this.#localise(frame);
+    const pose = await this.#localize(frame);
     if (!pose) return null;
     const found = deviations(pose, frame, this.#contract);
     const button = this.#list.children[this.#contract.frames.indexOf(frame)];

@@ -4,7 +4,7 @@ import { cross, dot, minus, unit } from "./vectors.js";
 
 const degrees = (radians) => (radians * 180) / Math.PI;
 
-/** One row of `trajectory.json` or `film.json`, as the localiser's answers look. */
+/** One row of `trajectory.json` or `film.json`, as the localizer's answers look. */
 export function poseOf([x, y, z, ...quaternion]) {
   return { position_m: [x, y, z], quaternion_wxyz: quaternion };
 }

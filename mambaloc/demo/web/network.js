@@ -29,7 +29,7 @@ export class Network {
   }
 
   /**
-   * Localise one picture.
+   * Localize one picture.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels, which a model that takes none leaves unread; the
    *   training camera's unless given.
@@ -37,7 +37,7 @@ export class Network {
    *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for a picture of elsewhere; where
    *   it knows several scenes, the likeliest one's name, probability, and offset in its world, in whose frame the pose is.
    */
-  async localise(image, intrinsics = null) {
+  async localize(image, intrinsics = null) {
     const start = performance.now();
     const feeds = this.#feeds(image, framing(image, this.#contract, intrinsics));
     const fed = performance.now();

@@ -1,7 +1,7 @@
 /** The numbers on the page. */
 
 import { attitude, median } from "./geometry.js";
-import { deviation } from "./localiser.js";
+import { deviation } from "./localizer.js";
 
 const LATENCIES = 30;
 const RATE_WINDOW_MS = 2000;
@@ -50,7 +50,7 @@ export class Readout {
 
   /**
    * Show one answer.
-   * @param pose of the localiser.
+   * @param pose of the localizer.
    * @param {string} source that the picture is from.
    * @param {string} file of a test frame, or "".
    */

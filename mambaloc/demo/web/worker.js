@@ -1,11 +1,11 @@
 /**
  * Network and map, off the page's thread.
  *
- * Is sent `{type: "start", backend, threads}` once, then `{type: "localise", id, bitmap, intrinsics}`. Answers with
+ * Is sent `{type: "start", backend, threads}` once, then `{type: "localize", id, bitmap, intrinsics}`. Answers with
  * `progress`, `ready`, `pose` and `error`.
  */
 
-import { Localiser, checkContract, modelOf } from "./localiser.js";
+import { Localizer, checkContract, modelOf } from "./localizer.js";
 import { readMap } from "./sparse_map.js";
 
 const HERE = new URL("./", import.meta.url);
@@ -19,14 +19,14 @@ const MAX_THREADS = 4;
 const STRIP_PIXELS = 2 ** 22; // iOS gives black, and no error, for canvases of more than 2^24
 const ERRORS_ONLY = 3;
 
-let localiser = null;
+let localizer = null;
 let context = null;
 
 self.onmessage = async ({ data }) => {
   try {
     if (data.type === "start") self.postMessage({ type: "ready", ...(await start(data)) });
     else {
-      const pose = await localiser.localise(pixels(data.bitmap), data.intrinsics);
+      const pose = await localizer.localize(pixels(data.bitmap), data.intrinsics);
       self.postMessage({ type: "pose", id: data.id, pose });
     }
   } catch (error) {
@@ -70,7 +70,7 @@ async function openMap(contract) {
   }
 }
 
-/** Load one backend, and let the model localise a grey picture: a backend that cannot says so here. */
+/** Load one backend, and let the model localize a grey picture: a backend that cannot says so here. */
 async function open(backend, model, contract, map, most) {
   const { library, binary } = BACKENDS[backend];
   const ort = await import(new URL(library, VENDOR));
@@ -81,9 +81,9 @@ async function open(backend, model, contract, map, most) {
   ort.env.wasm.wasmBinary = await fetched(new URL(binary, VENDOR), "runtime");
   ort.env.logLevel = "error";
   const options = { executionProviders: [backend], logSeverityLevel: ERRORS_ONLY };
-  const opened = await Localiser.create(ort, model, contract, map, options);
-  await opened.localise(grey(contract.preprocessing.crop));
-  localiser = opened;
+  const opened = await Localizer.create(ort, model, contract, map, options);
+  await opened.localize(grey(contract.preprocessing.crop));
+  localizer = opened;
   return { backend, threads };
 }
 

@@ -1,7 +1,7 @@
-// Localise pictures in a bundle's map.safetensors. C++17; OpenCV 4.8 or a later 4: core, imgproc, features2d, calib3d.
+// Localize pictures in a bundle's map.safetensors. C++17; OpenCV 4.8 or a later 4: core, imgproc, features2d, calib3d.
 //
-//   mambaloc::MapLocaliser localiser(bytes);                   // of the file; throws std::exception
-//   auto found = localiser.localise(rgb, intrinsics, &prior);  // prior: the network's pose, or nullptr
+//   mambaloc::MapLocalizer localizer(bytes);                   // of the file; throws std::exception
+//   auto found = localizer.localize(rgb, intrinsics, &prior);  // prior: the network's pose, or nullptr
 //   if (found.accepted || found.probability > 0.1) use(found); else use(network);  // 0.1: that the network is right
 //
 // Poses are world_from_cam: metres; OpenCV camera axes (x right, y down, z forward). One object serves any thread.
@@ -38,7 +38,7 @@ struct CameraPose {
   cv::Vec3d position_m;
 };
 
-struct MapLocalisation {
+struct MapLocalization {
   CameraPose pose;
   int inliers = 0;
   bool accepted = false;
@@ -48,22 +48,22 @@ struct MapLocalisation {
   cv::Matx66d covariance;
 };
 
-class MapLocaliser {
+class MapLocalizer {
  public:
-  explicit MapLocaliser(const std::vector<uint8_t>& bytes) { load(bytes); }
+  explicit MapLocalizer(const std::vector<uint8_t>& bytes) { load(bytes); }
 
   // rgb: CV_8UC3, upright, of any size. intrinsics: in its pixels; the centre of the top-left pixel is (0, 0).
-  MapLocalisation localise(const cv::Mat& rgb, const cv::Matx33d& intrinsics, const CameraPose* prior = nullptr) const {
+  MapLocalization localize(const cv::Mat& rgb, const cv::Matx33d& intrinsics, const CameraPose* prior = nullptr) const {
     const Features seen = detect(rgb, intrinsics);
     std::vector<cv::Vec3d> points;
     std::vector<cv::Vec2d> rays;
     match(seen, points, rays);
-    const MapLocalisation found = settled(seen, points, rays);
+    const MapLocalization found = settled(seen, points, rays);
     if (!prior || found.accepted) return found;
     points.clear(), rays.clear();
     search(seen, carried(*prior, -1).first, 12.0 * near_, points, rays);
-    const MapLocalisation guided = settled(seen, points, rays);
-    const auto rank = [](const MapLocalisation& each) { return std::make_tuple(each.accepted, each.probability, each.inliers); };
+    const MapLocalization guided = settled(seen, points, rays);
+    const auto rank = [](const MapLocalization& each) { return std::make_tuple(each.accepted, each.probability, each.inliers); };
     return rank(guided) > rank(found) ? guided : found;
   }
 
@@ -71,7 +71,7 @@ class MapLocaliser {
   // map's own camera; the network's pose as x y z qw qx qy qz, or nullptr. Returns the same 7 numbers, the inliers, and
   // the covariance's 36; nothing where no pose is accepted, nor likelier to be right than the prior's, taken for 0.1; nor where the
   // map's own camera does not have the picture's shape.
-  std::vector<double> localise(const uint8_t* rgb, int height, int width, const double* camera, const double* prior) const {
+  std::vector<double> localize(const uint8_t* rgb, int height, int width, const double* camera, const double* prior) const {
     if (!camera && std::abs(width * size_.height - height * size_.width) > std::max(size_.width, size_.height)) return {};
     const cv::Matx33d k = camera ? cv::Matx33d(camera[0], 0, camera[2], 0, camera[1], camera[3], 0, 0, 1)
                                  : rescaled(intrinsics_, size_, {width, height});
@@ -84,7 +84,7 @@ class MapLocaliser {
                          2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
     }
     const cv::Mat picture(height, width, CV_8UC3, const_cast<uint8_t*>(rgb));
-    const MapLocalisation found = localise(picture, k, prior ? &around : nullptr);
+    const MapLocalization found = localize(picture, k, prior ? &around : nullptr);
     if (!found.accepted && !(prior && found.probability > 0.1)) return {};
     cv::Vec3d turn;
     cv::Rodrigues(found.pose.rotation, turn);
@@ -197,8 +197,8 @@ class MapLocaliser {
   };
 
   // RANSAC; then search around the pose and refine it, twice.
-  MapLocalisation settled(const Features& seen, const std::vector<cv::Vec3d>& matched, const std::vector<cv::Vec2d>& at) const {
-    MapLocalisation answer;
+  MapLocalization settled(const Features& seen, const std::vector<cv::Vec3d>& matched, const std::vector<cv::Vec2d>& at) const {
+    MapLocalization answer;
     CameraPose start;
     if (!ransac(matched, at, start)) return answer;
     CameraPose pose = start;
@@ -211,7 +211,7 @@ class MapLocaliser {
     for (double window : {6.0, 2.0}) {
       points.clear(), rays.clear(), sights.clear();
       search(seen, pose, window * near_, points, rays, &sights);
-      if (points.size() < 4) return MapLocalisation();
+      if (points.size() < 4) return MapLocalization();
       finest = scale;
       answer.covariance = refine(pose, points, rays, finest);
       off.clear();

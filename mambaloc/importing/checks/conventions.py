@@ -82,7 +82,7 @@ def check_up(capture: Capture, up: Up, are_contradicted: bool = False) -> Findin
     if sideways >= _COMMON and sideways > up.common + _ON_THEIR_SIDE and not are_contradicted:
         concern = (
             "the pictures seem to lie on their side: the cameras' x axis, not y, keeps a direction; pictures to "
-            "localise must lie so, too"
+            "localize must lie so, too"
         )
     if not up.is_known:
         return Finding(

@@ -140,8 +140,8 @@ def intrinsics(capture: Capture, row: int, image: Image | None = None) -> Floats
         height, width = (read_image(capture.images[row]) if image is None else image).shape[:2]
         return assumed_intrinsics((width, height))
     camera = capture.cameras[capture.camera_of[row]]
-    focal_px, centre_px = camera.focal_px, camera.centre_px
-    return np.array([[focal_px[0], 0, centre_px[0]], [0, focal_px[1], centre_px[1]], [0, 0, 1]])
+    focal_px, center_px = camera.focal_px, camera.center_px
+    return np.array([[focal_px[0], 0, center_px[0]], [0, focal_px[1], center_px[1]], [0, 0, 1]])
 
 
 def _focal_px(features: Features) -> float:

@@ -37,7 +37,7 @@ from mambaloc.importing.formats.builder import (
 from mambaloc.importing.formats.parsing import array_of, first_with_pictures, folder_name, number_of, read_object
 from mambaloc.text import natural
 
-_OFF_CENTRE = 0.05
+_OFF_CENTER = 0.05
 _CHOICES = {
     "axes": "ARKit's camera axes (y up, looking along -z) turned to OpenCV's; the world is kept",
     "direction": "camera-to-world, as the format has it",
@@ -188,7 +188,7 @@ def _polycam_frame(path: Path, image: Path) -> tuple[np.ndarray, Camera]:
     return matrix, pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path)
 
 
-def _polycam_size(frame: dict[str, object], centre: Sequence[float], path: Path, image: Path) -> list[float]:
+def _polycam_size(frame: dict[str, object], center: Sequence[float], path: Path, image: Path) -> list[float]:
     """Width and height that a camera is told for: by itself, by the one that was not corrected, or by its image.
 
     That of the one that was not corrected counts where the principal point is about its middle: correcting may crop.
@@ -200,7 +200,7 @@ def _polycam_size(frame: dict[str, object], centre: Sequence[float], path: Path,
         if sides == [None, None]:
             continue
         size = array_of(sides, (2,), "width, height", file).tolist()
-        if file == path or all(abs(at - side / 2) <= _OFF_CENTRE * side for at, side in zip(centre, size, strict=True)):
+        if file == path or all(abs(at - side / 2) <= _OFF_CENTER * side for at, side in zip(center, size, strict=True)):
             return size
     height, width = read_image(image).shape[:2]
     return [float(width), float(height)]

@@ -229,7 +229,7 @@ def _repaired(name: str, what: str, off: Matrices, least: float, where: Callable
     return {name: f"{count} of {len(off)} were not {what}, and made so; at most {off[worst]:.2g} off ({where(worst)})"}
 
 
-def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[float], where: str | Path) -> Camera:
+def pinhole(size: Sequence[float], focal: Sequence[float], center: Sequence[float], where: str | Path) -> Camera:
     """Check a pinhole camera; the centre of the top-left pixel is (0, 0).
 
     Args:
@@ -243,17 +243,17 @@ def pinhole(size: Sequence[float], focal: Sequence[float], centre: Sequence[floa
     """
     width, height = size
     is_size = all(1 <= side <= LARGEST_SIDE_PX and side == int(side) for side in size)
-    if not is_size or not all(np.isfinite([*focal, *centre])) or min(focal) <= 0:
+    if not is_size or not all(np.isfinite([*focal, *center])) or min(focal) <= 0:
         raise InputError(
             f"{where}: a camera must have a size and finite, positive focal lengths, and at most {LARGEST_SIDE_PX} "
             "pixels a side; export it again"
         )
-    if not (abs(centre[0] - width / 2) <= width / 4 and abs(centre[1] - height / 2) <= height / 4):
+    if not (abs(center[0] - width / 2) <= width / 4 and abs(center[1] - height / 2) <= height / 4):
         raise InputError(
-            f"{where}: principal point {centre[0]:.0f}, {centre[1]:.0f} is far from the centre of images of "
+            f"{where}: principal point {center[0]:.0f}, {center[1]:.0f} is far from the centre of images of "
             f"{width:.0f}x{height:.0f}; give the intrinsics of these images, not of others' size"
         )
-    return Camera(int(width), int(height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
+    return Camera(int(width), int(height), (float(focal[0]), float(focal[1])), (float(center[0]), float(center[1])))
 
 
 def is_mark(poses: Matrices, rotations: Matrices) -> NDArray[np.bool_]:

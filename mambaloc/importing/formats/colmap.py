@@ -158,9 +158,9 @@ def _camera(camera: Any, path: Path) -> Camera:
             "Make smaller images, and reconstruct from these."
         )
     model = str(camera.model_name)
-    focal_px, centre_px = _pinhole(camera)
+    focal_px, center_px = _pinhole(camera)
     lens = None if model in _PINHOLES else _lens(camera)
-    return Camera(int(camera.width), int(camera.height), focal_px, centre_px, lens, model)
+    return Camera(int(camera.width), int(camera.height), focal_px, center_px, lens, model)
 
 
 def _pinhole(camera: Any) -> tuple[tuple[float, float], tuple[float, float]]:

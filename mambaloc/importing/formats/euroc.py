@@ -195,4 +195,4 @@ def _camera(path: Path) -> tuple[Camera, Matrices]:
         raise InputError(
             f"{path}: has {len(coefficients)} distortion_coefficients, {model} has {counts[0]}; correct it"
         )
-    return replace(camera, distorted=lens(camera.focal_px, camera.centre_px, coefficients), model=model), body_from_cam
+    return replace(camera, distorted=lens(camera.focal_px, camera.center_px, coefficients), model=model), body_from_cam

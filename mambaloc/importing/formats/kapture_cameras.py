@@ -57,11 +57,11 @@ def _camera(told: tuple[str, ...], where: str) -> Camera:
     focals, count = _FOCALS.get(model, 2), _COEFFICIENTS[model]
     if values is None or len(values) != 4 + focals + count or not np.isfinite(values).all():
         raise InputError(f"{where}: {model} must have {4 + focals + count} finite numbers; correct it")
-    size, focal, centre, coefficients = np.split(values, (2, 2 + focals, 4 + focals))
-    camera = pinhole(size.tolist(), (focal[0], focal[-1]), (centre - CORNER_PX).tolist(), where)
+    size, focal, center, coefficients = np.split(values, (2, 2 + focals, 4 + focals))
+    camera = pinhole(size.tolist(), (focal[0], focal[-1]), (center - CORNER_PX).tolist(), where)
     is_fisheye = model.endswith("FISHEYE")
     if not is_fisheye and not coefficients.any():
         return camera
     lens = FisheyeModel if is_fisheye else OpenCVModel
     padded = [*coefficients.tolist(), *[0.0] * (4 - count)]
-    return replace(camera, distorted=lens(camera.focal_px, camera.centre_px, padded), model=model)
+    return replace(camera, distorted=lens(camera.focal_px, camera.center_px, padded), model=model)

@@ -1,4 +1,4 @@
-"""Scenes of Map-free relocalisation: two scans of a place, ``seq0`` and ``seq1``, that share a world.
+"""Scenes of Map-free relocalization: two scans of a place, ``seq0`` and ``seq1``, that share a world.
 
 ``poses.txt`` has lines ``seq1/frame_00012.jpg qw qx qy qz tx ty tz``: world-to-camera, scalar first, in metres, in
 OpenCV's axes. Zeros throughout mark a pose that is kept back, as in the scenes of the test set, and a frame without a

@@ -188,13 +188,13 @@ def _sensor(path: Path, chunk: Element, number: str) -> Camera:
         told[name] = float(values[0])
     size = _size(calibration.find("resolution"), sensor.find("resolution"))
     focal, affinity = told["f"], (told["b1"], told["b2"])
-    centre = [side / 2 + told[name] - CORNER_PX for side, name in zip(size, ("cx", "cy"), strict=True)]
-    camera = pinhole(size, (focal + affinity[0], focal), centre, where)
+    center = [side / 2 + told[name] - CORNER_PX for side, name in zip(size, ("cx", "cy"), strict=True)]
+    camera = pinhole(size, (focal + affinity[0], focal), center, where)
     radial, tangential = ([told[f"{letter}{n}"] for n in (1, 2, 3, 4)] for letter in "kp")
     is_fisheye = kind in _FISHEYES
     if not any((*radial, *tangential, affinity[1], is_fisheye)):
         return camera
-    lens = photogrammetric_lens(focal, camera.centre_px, radial, tangential, affinity, is_fisheye)
+    lens = photogrammetric_lens(focal, camera.center_px, radial, tangential, affinity, is_fisheye)
     return replace(camera, distorted=lens, model=f"Metashape's {kind}")
 
 

@@ -84,13 +84,13 @@ def _camera(told: Mapping[str, Any], images: Sequence[Path], where: str) -> Came
     sides = [side for side in size if side] if all(size) else list(map(float, first_size(images)))
     focal = [_focal(told, axis, sides[axis], where) for axis in (0, 1)]
     focal_px = (focal[0], focal[1]) if focal[0] and focal[1] else (focal[0] or focal[1],) * 2
-    centre = [number(told, key, where) for key in ("cx", "cy")]
-    centre_px = [side / 2 if at is None else at for at, side in zip(centre, sides, strict=True)]
+    center = [number(told, key, where) for key in ("cx", "cy")]
+    center_px = [side / 2 if at is None else at for at, side in zip(center, sides, strict=True)]
     if not all(1 <= side <= LARGEST_SIDE_PX for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
         raise InputError(f"{where}: {sides[0]:g}x{sides[1]:g} pixels, focal length {focal_px[0]:g}: correct it")
-    if not all(-side < at < 2 * side for at, side in zip(centre_px, sides, strict=True)):
-        raise InputError(f"{where}: its centre {centre_px} is far outside of the image; correct it")
-    camera = Camera(round(sides[0]), round(sides[1]), focal_px, (centre_px[0] - CORNER_PX, centre_px[1] - CORNER_PX))
+    if not all(-side < at < 2 * side for at, side in zip(center_px, sides, strict=True)):
+        raise InputError(f"{where}: its centre {center_px} is far outside of the image; correct it")
+    camera = Camera(round(sides[0]), round(sides[1]), focal_px, (center_px[0] - CORNER_PX, center_px[1] - CORNER_PX))
     return _with_lens(camera, told, where)
 
 
@@ -116,7 +116,7 @@ def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
         "OPENCV_FISHEYE" if is_fisheye else "OPENCV" if any(coefficients) else "PINHOLE"
     )
     if model == "OPENCV_FISHEYE":
-        fisheye = FisheyeModel(camera.focal_px, camera.centre_px, (k1, k2, k3, k4))
+        fisheye = FisheyeModel(camera.focal_px, camera.center_px, (k1, k2, k3, k4))
         return replace(camera, distorted=fisheye, model=model)
     if model not in _BROWN:
         raise InputError(
@@ -127,7 +127,7 @@ def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
         raise InputError(f"{where}: k4 is {k4:g}, which OpenCV's lens has not; give camera_model OPENCV_FISHEYE, or 0")
     if not any(coefficients):
         return replace(camera, model=model)
-    lens = OpenCVModel(camera.focal_px, camera.centre_px, (k1, k2, p1, p2, k3))
+    lens = OpenCVModel(camera.focal_px, camera.center_px, (k1, k2, p1, p2, k3))
     return replace(camera, distorted=lens, model=model)
 
 

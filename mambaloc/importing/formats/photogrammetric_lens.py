@@ -24,7 +24,7 @@ Pixels = NDArray[np.float64]
 
 def photogrammetric_lens(
     focal_px: float,
-    centre_px: tuple[float, float],
+    center_px: tuple[float, float],
     radial: Sequence[float],
     tangential: Sequence[float],
     affinity_px: tuple[float, float] = (0.0, 0.0),
@@ -43,7 +43,7 @@ def photogrammetric_lens(
     k1, k2, k3, k4 = radial
     p1, p2, p3, p4 = tangential
     if not is_fisheye and not any((k4, p3, p4, *affinity_px)):
-        return OpenCVModel((focal_px, focal_px), centre_px, (k1, k2, p2, p1, k3))  # which can be kept for queries
+        return OpenCVModel((focal_px, focal_px), center_px, (k1, k2, p2, p1, k3))  # which can be kept for queries
 
     def distorted(rays: Pixels) -> Pixels:
         if is_fisheye:
@@ -56,7 +56,7 @@ def photogrammetric_lens(
             more = 1 + r2 * (p3 + r2 * p4)
             bent_x = x * scale + (p1 * (r2 + 2 * x**2) + 2 * p2 * x * y) * more
             bent_y = y * scale + (p2 * (r2 + 2 * y**2) + 2 * p1 * x * y) * more
-            u = centre_px[0] + bent_x * (focal_px + affinity_px[0]) + bent_y * affinity_px[1]
-            return np.stack((u, centre_px[1] + bent_y * focal_px), axis=1)
+            u = center_px[0] + bent_x * (focal_px + affinity_px[0]) + bent_y * affinity_px[1]
+            return np.stack((u, center_px[1] + bent_y * focal_px), axis=1)
 
     return distorted

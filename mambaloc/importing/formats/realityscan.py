@@ -173,13 +173,13 @@ def _camera(size: tuple[int, int], numbers: Sequence[float], where: str) -> Came
     focal, px, py, *radial, t1, t2 = numbers
     longer = max(size)
     focal_px = focal / _FILM_MM * longer
-    centre = [side / 2 + share * longer - CORNER_PX for side, share in zip(size, (px, py), strict=True)]
-    camera = pinhole(size, (focal_px, focal_px), centre, where)
+    center = [side / 2 + share * longer - CORNER_PX for side, share in zip(size, (px, py), strict=True)]
+    camera = pinhole(size, (focal_px, focal_px), center, where)
     if not np.isfinite([*radial, t1, t2]).all():
         raise InputError(f"{where}: k1 to k4, t1 and t2 must be finite; export it again")
     if not any((*radial, t1, t2)):
         return camera
-    lens = photogrammetric_lens(focal_px, camera.centre_px, radial, (t1, t2, 0.0, 0.0))
+    lens = photogrammetric_lens(focal_px, camera.center_px, radial, (t1, t2, 0.0, 0.0))
     return replace(camera, distorted=lens, model="RealityScan's Brown")
 
 

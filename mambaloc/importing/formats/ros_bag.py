@@ -129,8 +129,8 @@ def camera_from(told: BagCamera, where: str) -> Camera:
             f"{where}: has the distortion model {told.model!r} with {len(told.coefficients)} coefficients, which is "
             f"not read ({', '.join(_LENSES)}). Record a rectified topic."
         )
-    distorted = lens(camera.focal_px, camera.centre_px, told.coefficients)
-    return Camera(camera.width, camera.height, camera.focal_px, camera.centre_px, distorted, told.model)
+    distorted = lens(camera.focal_px, camera.center_px, told.coefficients)
+    return Camera(camera.width, camera.height, camera.focal_px, camera.center_px, distorted, told.model)
 
 
 def straightener(told: BagCamera, size: tuple[int, int]) -> tuple[NDArray[np.float64], Callable[[Image], Image]]:

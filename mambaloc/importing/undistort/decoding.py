@@ -93,7 +93,7 @@ def choices_of(counts: Counts | None) -> dict[str, str]:
         return {}
     black, white = counts
     said = (
-        f"counts {black} to {white} are black to white in all pictures, which hold 8 bits now; pictures to localise "
+        f"counts {black} to {white} are black to white in all pictures, which hold 8 bits now; pictures to localize "
         f"need the same: localize.py --counts {black},{white}"
     )
     return {"16 bits": said}

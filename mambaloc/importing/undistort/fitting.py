@@ -95,16 +95,16 @@ def scaled(camera: Camera, size: Size) -> Camera:
         return (lens(rays) + CORNER_PX) * (x, y) - CORNER_PX
 
     there = lens.scaled((x, y)) if isinstance(lens, CameraModel) else lens and distorted
-    focal_px, centre_px = scaled_intrinsics(camera.focal_px, camera.centre_px, (x, y))
-    return Camera(*size, focal_px, centre_px, there, camera.model)
+    focal_px, center_px = scaled_intrinsics(camera.focal_px, camera.center_px, (x, y))
+    return Camera(*size, focal_px, center_px, there, camera.model)
 
 
 def cropped(pinhole: Camera, size: Size) -> Camera:
     """A pinhole of the middle of its pictures, of a size (width, height)."""
     width, height = size
     top, left = center_corner((pinhole.height, pinhole.width), (height, width))
-    cx, cy = pinhole.centre_px
-    return replace(pinhole, width=width, height=height, centre_px=(cx - left, cy - top))
+    cx, cy = pinhole.center_px
+    return replace(pinhole, width=width, height=height, center_px=(cx - left, cy - top))
 
 
 def common_sizes(sizes: Iterable[Size]) -> dict[Size, Size]:

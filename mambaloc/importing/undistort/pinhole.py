@@ -53,9 +53,9 @@ def _reach(camera: Camera, zoom: float) -> NDArray[np.float64] | None:
     along = np.linspace(0, 1, _BORDER_POINTS)
     sides = [np.stack((along, np.full_like(along, end)), axis=-1) for end in (0, 1)]
     border = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * last
-    rays = (border - camera.centre_px) / (np.array(camera.focal_px) * zoom)
+    rays = (border - camera.center_px) / (np.array(camera.focal_px) * zoom)
     assert camera.distorted is not None
     seen = camera.distorted(rays)
     if not np.isfinite(seen).all() or (seen < 0).any() or (seen > last).any():
         return None
-    return np.linalg.norm(seen - camera.centre_px, axis=-1)
+    return np.linalg.norm(seen - camera.center_px, axis=-1)

@@ -105,7 +105,7 @@ def pose_covariance(pose: CameraPose, points_m: Floats, rays: Floats, near: floa
         gradient (Huber 1967): Cauchy's weights are not variances, so the inverse of the normal equations is too small
         where residuals are as large as their scale.
     """
-    linear = _linearised(pose, points_m, rays, near)
+    linear = _linearized(pose, points_m, rays, near)
     if linear is None:
         return np.full((6, 6), np.inf)
     off, jacobian, _ = linear
@@ -131,7 +131,7 @@ def focal_scale(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -
     Returns:
         The scale, 1 where the intrinsics fit, and its standard deviation, which is infinite where nothing says.
     """
-    linear = _linearised(pose, points_m, rays, near)
+    linear = _linearized(pose, points_m, rays, near)
     if linear is None:
         return 1.0, np.inf
     off, jacobian, seen = linear
@@ -150,7 +150,7 @@ def _moved(pose: CameraPose, step: Floats) -> CameraPose:
     return CameraPose(pose.rotation @ cv2.Rodrigues(step[3:])[0], pose.position_m + pose.rotation @ step[:3])
 
 
-def _linearised(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[Floats, Floats, Floats] | None:
+def _linearized(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[Floats, Floats, Floats] | None:
     """Residuals in halves of ``near`` (2, M), their slopes (6, 2, M) by steps of :func:`_moved`, and where points are
     seen (2, M).
 
@@ -177,7 +177,7 @@ def _linearised(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -
 
 def _normal_equations(pose: CameraPose, points_m: Floats, rays: Floats, near: float) -> tuple[float, Floats, Floats]:
     """Cost, ``J^T W J`` (6, 6) and ``-J^T W r`` (6,)."""
-    linear = _linearised(pose, points_m, rays, near)
+    linear = _linearized(pose, points_m, rays, near)
     if linear is None:
         return np.inf, np.eye(6), np.zeros(6)
     off, jacobian, _ = linear

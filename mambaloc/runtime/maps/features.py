@@ -132,8 +132,8 @@ def check_intrinsics(intrinsics: ArrayLike, size: tuple[int, int]) -> None:
     matrix = np.asarray(intrinsics, np.float64)
     fits = matrix.shape == (3, 3) and np.isfinite(matrix).all() and np.abs(matrix[2] - (0, 0, 1)).max() < 1e-8
     if fits:
-        focal, centre = np.diag(matrix)[:2] / size[0], matrix[:2, 2] / size
-        fits = bool((focal > 0.09).all() and (focal < 10).all() and (centre > 0).all() and (centre < 1).all())
+        focal, center = np.diag(matrix)[:2] / size[0], matrix[:2, 2] / size
+        fits = bool((focal > 0.09).all() and (focal < 10).all() and (center > 0).all() and (center < 1).all())
     if not fits:
         numbers = np.array2string(matrix, precision=1, separator=" ").replace("\n", "")
         raise InputError(

@@ -36,20 +36,20 @@ def write_list(folder: Path, lines: list[str], split: str = "train", header: str
 def test_the_files_quaternion_is_world_to_camera(tmp_path):
     """A world point seen by a camera: ``p_cam = R_file (p_world - centre)``, the dataset's own definition."""
     rng = np.random.default_rng(0)
-    cam_from_world, centre = Rotation.from_quat(rng.normal(size=(8, 4))), rng.uniform(-50, 50, (8, 3))
+    cam_from_world, center = Rotation.from_quat(rng.normal(size=(8, 4))), rng.uniform(-50, 50, (8, 3))
     wxyz = cam_from_world.as_quat()[:, [3, 0, 1, 2]]  # of either sign
     names = [f"seq{1 + i // 5}/frame{i:05d}.png" for i in range(8)]
     write_list(
         tmp_path,
-        [f"{n} {' '.join(map(repr, map(float, (*c, *q))))}" for n, c, q in zip(names, centre, wxyz, strict=True)],
+        [f"{n} {' '.join(map(repr, map(float, (*c, *q))))}" for n, c, q in zip(names, center, wxyz, strict=True)],
     )
     frames = read_split(tmp_path, "train", bad := BadFrames())
     assert [str(path.relative_to(tmp_path)) for path in frames.image_paths] == names
     assert frames.sequences == ("seq1",) * 5 + ("seq2",) * 3
     assert not bad.repaired
-    np.testing.assert_array_equal(frames.position_m, centre)
+    np.testing.assert_array_equal(frames.position_m, center)
     world_from_cam = Rotation.from_quat(frames.quaternion[:, [1, 2, 3, 0]])
-    seen = cam_from_world.apply(np.array([3.0, 4, 5]) - centre)
+    seen = cam_from_world.apply(np.array([3.0, 4, 5]) - center)
     np.testing.assert_allclose(world_from_cam.apply(seen) + frames.position_m, np.tile([3.0, 4, 5], (8, 1)), atol=1e-9)
     assert (frames.quaternion[:, 0] >= 0).all()
 
@@ -127,7 +127,7 @@ def expect_rejection(folder: Path, place: str, rule: str) -> None:
 
 
 @pytest.mark.parametrize("scale", [2.0, 0.9, 1.002, 1e200])
-def test_quaternion_of_another_length_is_normalised_and_counted(tmp_path, scale):
+def test_quaternion_of_another_length_is_normalized_and_counted(tmp_path, scale):
     wxyz = np.array([0.1, -0.7, 0.5, 0.5]) / np.linalg.norm([0.1, -0.7, 0.5, 0.5])
     write_list(tmp_path, [f"seq1/a.png 1 2 3 {' '.join(map(str, scale * wxyz))}", f"seq1/b.png {GOOD}"])
     frames = read_split(tmp_path, "train", bad := BadFrames("error"))

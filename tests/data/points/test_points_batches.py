@@ -69,7 +69,7 @@ def projected(batch: PoseBatch) -> np.ndarray:
     return np.array(pixels)
 
 
-def red_centres(image: torch.Tensor) -> np.ndarray:
+def red_centers(image: torch.Tensor) -> np.ndarray:
     """The centre of what is red in each picture, pixels (B, 2)."""
     red = image[:, 0].double()
     red = red / red.sum((-2, -1), keepdim=True)
@@ -92,10 +92,10 @@ def test_points_project_onto_their_texture_in_every_crop(make, training):
     shifts = []
     for loader in (module.train_dataloader(), module.val_dataloader()):
         for batch in loader:
-            np.testing.assert_allclose(projected(batch), red_centres(batch.image), atol=0.05)
+            np.testing.assert_allclose(projected(batch), red_centers(batch.image), atol=0.05)
             out = module.on_after_batch_transfer(batch, 0)
             assert out.image.shape[-2:] == CROP
-            np.testing.assert_allclose(projected(out), red_centres(out.image), atol=0.05)
+            np.testing.assert_allclose(projected(out), red_centers(out.image), atol=0.05)
             assert out.points_m is batch.points_m
             shifts.append(batch.intrinsics[:, :2, 2] - out.intrinsics[:, :2, 2])
     corners = torch.cat(shifts)
@@ -124,7 +124,7 @@ def test_each_frame_has_its_own_points_also_where_others_are_skipped(make, scene
         "000004",
     ]
     for batch in module.train_dataloader():
-        np.testing.assert_allclose(projected(batch), red_centres(batch.image), atol=0.05)
+        np.testing.assert_allclose(projected(batch), red_centers(batch.image), atol=0.05)
         assert batch.points_m.shape[1:] == (2, 3)
         assert batch.points_m[:, 1].isnan().all()  # each frame has depth at one pixel
 
@@ -138,7 +138,7 @@ def test_test_frames_carry_points_only_where_they_are_validated_on(make):
     selecting = make(validation="test_set")
     selecting.setup("fit")
     (validated,) = selecting.val_dataloader()
-    np.testing.assert_allclose(projected(validated), red_centres(validated.image), atol=0.05)
+    np.testing.assert_allclose(projected(validated), red_centers(validated.image), atol=0.05)
 
 
 def test_by_default_none_are_read(make):

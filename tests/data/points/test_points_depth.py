@@ -155,7 +155,7 @@ def test_the_scenes_own_depth_camera_comes_first(tiny):
     np.testing.assert_allclose([[*pixels[0], z_m[0]]], [[3, 2, 0.9]], atol=1e-4)
 
 
-def test_a_frame_borrows_what_its_colour_camera_sees(tiny):
+def test_a_frame_borrows_what_its_color_camera_sees(tiny):
     """Frames of one pose, depth of one: a camera with a narrower view sees fewer of its points."""
     write_depth(tiny.images[0], np.full((24, 32), 900, np.uint16))
     for image in tiny.images[1:]:

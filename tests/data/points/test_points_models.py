@@ -250,11 +250,11 @@ def write_model(folder: Path, binary: bool, camera_model: str = "SIMPLE_RADIAL",
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(camera_id=1, model=camera_model, width=80, height=60, params=params)
     )
-    for number, (name, xyzw, centre) in enumerate([("a", [0, 0, 0, 1], [1, 2, 3]), ("b", [0, 0, 1, 0], [4, 5, 6])]):
+    for number, (name, xyzw, center) in enumerate([("a", [0, 0, 0, 1], [1, 2, 3]), ("b", [0, 0, 1, 0], [4, 5, 6])]):
         rotation = Rotation.from_quat(xyzw)
         observations = pycolmap.Point2DList([pycolmap.Point2D(np.zeros(2)) for _ in range(2)])
         image = pycolmap.Image(name=f"seq1/{name}.jpg", camera_id=1, image_id=number + 1, points2D=observations)
-        t = -rotation.apply(np.add(centre, (shift_m, 0, 0)))
+        t = -rotation.apply(np.add(center, (shift_m, 0, 0)))
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(xyzw, float)), t))
     for xyz, seen_by in (([1.0, 2, 9], ((1, 0), (2, 0))), ([5.0, 5, 5], ((2, 1),))):
         track = pycolmap.Track()

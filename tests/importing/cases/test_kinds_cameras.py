@@ -26,10 +26,10 @@ SPREAD = 90.0  # grey levels a unit of ray
 # --- cameras ---------------------------------------------------------------------------------------------------------
 
 
-def seen(width, height, focal, centre, k1):
+def seen(width, height, focal, center, k1):
     """A picture whose red and green say where the ray of a pixel meets the plane at depth 1."""
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    rays = np.stack(((columns - centre[0]) / focal[0], (rows - centre[1]) / focal[1]), axis=-1)
+    rays = np.stack(((columns - center[0]) / focal[0], (rows - center[1]) / focal[1]), axis=-1)
     ideal = rays.copy()
     for _ in range(60):  # Brown's model undone by fixed-point iteration
         ideal = rays / (1 + k1 * (ideal**2).sum(axis=-1, keepdims=True))
@@ -55,14 +55,14 @@ def test_written_pictures_show_what_their_cameras_say(devices):
     """Whatever sizes are mixed: scaled, cropped and undistorted, a pixel's colour is that of its ray."""
     with TemporaryDirectory() as name:
         folder, cameras, images = Path(name), {}, []
-        for number, (size, (width, height, focal, centre, k1)) in enumerate(devices):
+        for number, (size, (width, height, focal, center, k1)) in enumerate(devices):
             scale = size[0] / width
-            middle = tuple(at * scale - 0.5 for at in centre)
+            middle = tuple(at * scale - 0.5 for at in center)
             images.append(folder / f"{number}.png")
             cv2.imwrite(str(images[-1]), seen(*size, [f * scale for f in focal], middle, k1))
-            centre_px = (centre[0] - 0.5, centre[1] - 0.5)
-            lens = OpenCVModel(focal, centre_px, (k1, 0, 0, 0, 0)) if k1 else None
-            cameras[f"camera-{number}"] = Camera(width, height, focal, centre_px, lens)
+            center_px = (center[0] - 0.5, center[1] - 0.5)
+            lens = OpenCVModel(focal, center_px, (k1, 0, 0, 0, 0)) if k1 else None
+            cameras[f"camera-{number}"] = Camera(width, height, focal, center_px, lens)
         capture = capture_of(
             poses_at(line(len(images))), images=tuple(images), cameras=cameras, camera_of=tuple(cameras)
         )
@@ -76,10 +76,10 @@ def test_written_pictures_show_what_their_cameras_say(devices):
             shown = cv2.imread(str(image)).astype(float)
             assert shown.shape[1::-1] == size == (camera.width, camera.height)
             columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-            for colour, places, focal, centre in zip(
-                (2, 1), (columns, rows), camera.focal_px, camera.centre_px, strict=True
+            for color, places, focal, center in zip(
+                (2, 1), (columns, rows), camera.focal_px, camera.center_px, strict=True
             ):
-                off = np.abs(shown[..., colour] - (128 + SPREAD * (places - centre) / focal))
+                off = np.abs(shown[..., color] - (128 + SPREAD * (places - center) / focal))
                 assert off.max() < 1.6  # two roundings, and the border's last hundredth of a pixel
 
 
@@ -103,7 +103,7 @@ def test_a_side_may_be_rounded_either_way(width, height, by, up):
     small = tuple(-(-side // by) if up else side // by for side in (width, height))
     found = fitted(camera, small)
     assert found is not None
-    assert found.centre_px == pytest.approx((small[0] / 2 - 0.5, small[1] / 2 - 0.5))
+    assert found.center_px == pytest.approx((small[0] / 2 - 0.5, small[1] / 2 - 0.5))
     assert found.focal_px == pytest.approx((100 * small[0] / width, 100 * small[1] / height))
     assert fitted(camera, (small[0], small[1] + 4 + small[1] // 4)) is None
 

@@ -222,7 +222,7 @@ def test_the_peak_lies_between_the_focal_lengths_that_were_tried():
 
 
 @pytest.mark.skipif(not REDKITCHEN.is_dir(), reason="needs ../shared/data/7scenes_blocks beside the repository")
-def test_the_focal_length_of_real_frames_is_that_of_the_colour_camera():
+def test_the_focal_length_of_real_frames_is_that_of_the_color_camera():
     """525 px at a width of 640, as data/cameras.py has it, not the depth sensor's 585; training frames alone.
 
     Takes ten seconds: 700 keypoints in each of 70 real pictures.

@@ -61,7 +61,7 @@ def test_a_record3d_recording_is_read_back(recording, metadata, tmp_path, names)
     assert [path.read_bytes() for path in capture.images] == recording.jpegs
     (camera,) = capture.cameras.values()
     assert capture.camera_of == tuple(capture.cameras) * FRAMES
-    assert (camera.width, camera.height, camera.focal_px, camera.centre_px) == (*SIZE, (58, 59), (32.5, 24.5))
+    assert (camera.width, camera.height, camera.focal_px, camera.center_px) == (*SIZE, (58, 59), (32.5, 24.5))
 
 
 def test_the_lens_of_each_frame_and_its_time(record3d, metadata):
@@ -160,7 +160,7 @@ def test_optimised_polycam_poses_are_preferred(polycam, recording, place):
     assert {path.parent.name for path in capture.images} == {"corrected_images"}
     assert capture.choices["poses"] == "6 optimised by the app"
     (camera,) = capture.cameras.values()
-    assert (camera.focal_px, camera.centre_px) == ((58, 58), (32.5, 24.5))
+    assert (camera.focal_px, camera.center_px) == ((58, 58), (32.5, 24.5))
 
 
 def test_which_polycam_poses_were_taken_is_stated(polycam, recording):

@@ -38,7 +38,7 @@ def test_a_focal_length_for_each_picture(source, walk):
     assert [capture.split[row] for row in order] == ["train"] * 8 + ["test"] * 4
     (camera,) = capture.cameras.values()
     assert camera.focal_px == pytest.approx((walk.intrinsics[0, 0],) * 2)
-    assert camera.centre_px == (159.5, 119.5)
+    assert camera.center_px == (159.5, 119.5)
 
 
 def test_pictures_agree_with_the_cameras(source, walk):
@@ -54,7 +54,7 @@ def test_a_matrix_is_a_camera_of_its_own(source):
     capture = read_capture(source)
     row = [image.name for image in capture.images].index("frame_00009.png")
     camera = capture.cameras[capture.camera_of[row]]
-    assert (camera.focal_px, camera.centre_px) == ((300, 301), (160.5, 121))
+    assert (camera.focal_px, camera.center_px) == ((300, 301), (160.5, 121))
     assert len(capture.cameras) == 2
 
 

@@ -34,7 +34,7 @@ def test_a_model_is_read_back(recording, tmp_path, binary, model, images):
     assert capture.camera_of == ("camera-1",) * FRAMES
     assert capture.images_without_pose == (tmp_path / images / "run" / "12.jpg",)
     camera = capture.cameras["camera-1"]
-    assert (camera.width, camera.height, camera.focal_px, camera.centre_px) == (*SIZE, (60, 60), (32.5, 24.5))
+    assert (camera.width, camera.height, camera.focal_px, camera.center_px) == (*SIZE, (60, 60), (32.5, 24.5))
 
 
 def test_points_are_read_with_their_tracks(recording, tmp_path):
@@ -99,10 +99,10 @@ def test_pixels_are_those_of_an_independent_projection(recording, tmp_path, mode
     assert camera.model == model
     if "PINHOLE" in model:
         assert camera.distorted is None
-        pixels = rays * camera.focal_px + np.array(camera.centre_px)
+        pixels = rays * camera.focal_px + np.array(camera.center_px)
     else:
         pixels = camera.distorted(rays)
-        assert np.abs(pixels - rays * camera.focal_px - camera.centre_px).max() > 0.1  # it does distort
+        assert np.abs(pixels - rays * camera.focal_px - camera.center_px).max() > 0.1  # it does distort
     np.testing.assert_allclose(pixels, oracle(model, rays), atol=1e-6)
     assert isinstance(camera.distorted, CameraModel) == (model not in ("PINHOLE", "SIMPLE_PINHOLE", "FOV"))
 

@@ -52,7 +52,7 @@ def test_a_sequence_is_read_back(kitti, recording, place):
     camera = capture.cameras["image_2"]
     assert (camera.width, camera.height, camera.distorted) == (*SIZE, None)
     np.testing.assert_allclose(
-        (*camera.focal_px, *camera.centre_px), default_intrinsics(SIZE)[[0, 1, 0, 1], [0, 1, 2, 2]]
+        (*camera.focal_px, *camera.center_px), default_intrinsics(SIZE)[[0, 1, 0, 1], [0, 1, 2, 2]]
     )
 
 
@@ -64,7 +64,7 @@ def test_a_world_point_falls_where_the_calibration_projects_it(kitti):
     projection = np.array(words, dtype=float).reshape(3, 4)
     camera = capture.cameras["image_2"]
     matrix = np.array(
-        [[camera.focal_px[0], 0, camera.centre_px[0]], [0, camera.focal_px[1], camera.centre_px[1]], [0, 0, 1]]
+        [[camera.focal_px[0], 0, camera.center_px[0]], [0, camera.focal_px[1], camera.center_px[1]], [0, 0, 1]]
     )
     for pose0, pose in zip(world_from_cam0, capture.world_from_cam, strict=True):
         point_cam0 = np.array([0.3, -0.2, 2.0])

@@ -47,7 +47,7 @@ def test_two_scans_are_read_and_their_pictures_agree(source, walk):
     assert capture.sequences == ("seq0",) * 5 + ("seq1",) * 7
     walk.is_agreed(capture)
     (camera,) = capture.cameras.values()
-    assert camera.centre_px == tuple(walk.intrinsics[:2, 2])
+    assert camera.center_px == tuple(walk.intrinsics[:2, 2])
     assert capture.choices["not read"] == "poses_device.txt"
 
 

@@ -124,7 +124,7 @@ def test_one_camera_for_all(write, tmp_path):
     (camera,) = capture.cameras.values()
     assert capture.camera_of == ("camera-1", "camera-1")
     assert (camera.width, camera.height, camera.focal_px) == (WIDTH, HEIGHT, (30.0, 31.0))
-    assert camera.centre_px == (15.5, 12.0)  # pixels counted from the corner become pixels counted from a centre
+    assert camera.center_px == (15.5, 12.0)  # pixels counted from the corner become pixels counted from a centre
     assert camera.distorted is None
     assert camera.model == "PINHOLE"
 
@@ -142,7 +142,7 @@ def test_an_angle_of_view_alone(write, tmp_path):
     write(camera_angle_x=0.9)
     (camera,) = read_capture(tmp_path).cameras.values()
     assert camera.focal_px == (pytest.approx(WIDTH / 2 / math.tan(0.45)),) * 2
-    assert camera.centre_px == ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    assert camera.center_px == ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
 def test_no_camera_at_all(write, tmp_path):
@@ -156,7 +156,7 @@ def test_smaller_images_than_the_file_speaks_of(write, tmp_path):
     capture = read_capture(tmp_path)
     (told,) = capture.cameras.values()
     camera = fitted(told, (WIDTH, HEIGHT))
-    assert (camera.width, camera.height, camera.focal_px, camera.centre_px) == (
+    assert (camera.width, camera.height, camera.focal_px, camera.center_px) == (
         WIDTH,
         HEIGHT,
         (30.0, 31.0),

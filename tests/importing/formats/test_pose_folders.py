@@ -48,7 +48,7 @@ def test_a_scannet_recording_is_read_back(scannet, recording, place, tmp_path_fa
     camera = capture.cameras["color"]
     assert (camera.width, camera.height) == SIZE
     np.testing.assert_allclose(
-        (*camera.focal_px, *camera.centre_px), default_intrinsics(SIZE)[[0, 1, 0, 1], [0, 1, 2, 2]]
+        (*camera.focal_px, *camera.center_px), default_intrinsics(SIZE)[[0, 1, 0, 1], [0, 1, 2, 2]]
     )
 
 
@@ -131,7 +131,7 @@ def test_a_replica_scene_is_read_back(replica, recording):
     np.testing.assert_allclose(capture.world_from_cam, recording.world_from_cam, atol=1e-12)
     assert [path.read_bytes() for path in capture.images] == recording.jpegs
     camera = capture.cameras["frame"]
-    assert (camera.width, camera.height, camera.focal_px, camera.centre_px) == (*SIZE, (60, 61), (31.5, 23.5))
+    assert (camera.width, camera.height, camera.focal_px, camera.center_px) == (*SIZE, (60, 61), (31.5, 23.5))
     assert not capture.images_without_pose  # depth is none
 
 

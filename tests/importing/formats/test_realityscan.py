@@ -78,14 +78,14 @@ def test_what_angles_mean(write, angles, forward, down):
     np.testing.assert_allclose(rotation[:, 2], forward, atol=1e-12)
     np.testing.assert_allclose(rotation[:, 1], down, atol=1e-12)
     np.testing.assert_array_equal(capture.world_from_cam[0, :3, 3], (1, 2, 3))
-    assert capture.cameras["camera-1"].centre_px == (159.5, 119.5)  # columns that are not there are zeros
+    assert capture.cameras["camera-1"].center_px == (159.5, 119.5)  # columns that are not there are zeros
     assert capture.cameras["camera-1"].focal_px[0] == pytest.approx(30 / 36 * 320)
 
 
 def test_the_principal_point_is_a_share_of_the_longer_side(write, lens):
     lens[1:3] = 0.01, -0.02
     (camera,) = write(changed=lens).cameras.values()
-    assert camera.centre_px == pytest.approx((159.5 + 3.2, 119.5 - 6.4))
+    assert camera.center_px == pytest.approx((159.5 + 3.2, 119.5 - 6.4))
 
 
 def test_the_lens_is_opencvs_with_its_tangential_terms_swapped(write, walk, lens):

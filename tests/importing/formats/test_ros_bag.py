@@ -85,7 +85,7 @@ def test_poses_are_those_of_the_optical_frame_at_the_pictures_times(record, driv
     (camera,) = capture.cameras.values()
     assert (camera.width, camera.height, camera.distorted) == (*SIZE, None)
     assert camera.focal_px == pytest.approx((K[0, 0], K[1, 1]))
-    assert camera.centre_px == pytest.approx((K[0, 2], K[1, 2]))
+    assert camera.center_px == pytest.approx((K[0, 2], K[1, 2]))
     assert "odom -> base_link -> camera_optical" in capture.choices["direction"]
     assert "gaps" not in capture.choices
 

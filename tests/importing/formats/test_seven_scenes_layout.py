@@ -21,7 +21,7 @@ def test_a_scene_is_read_back(scenes):
     assert dict.fromkeys(capture.sequences) == dict.fromkeys(("seq-01", "seq-02", "seq-03"))
     (camera,) = capture.cameras.values()
     matrix = default_intrinsics((96, 72))
-    np.testing.assert_allclose((*camera.focal_px, *camera.centre_px), matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
+    np.testing.assert_allclose((*camera.focal_px, *camera.center_px), matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
     np.testing.assert_allclose(capture.depth.intrinsics, matrix)
     assert [file.name for file in capture.depth.files[:2]] == ["frame-000000.depth.png", "frame-000001.depth.png"]
 

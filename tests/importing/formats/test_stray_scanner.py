@@ -80,7 +80,7 @@ def test_a_recording_is_read_back(source, walk):
     np.testing.assert_allclose(capture.time_s, FIRST_S + np.array(numbers) / 30, atol=1e-6)
     (camera,) = capture.cameras.values()
     matrix = default_intrinsics(SIZE)
-    assert camera.centre_px == pytest.approx(tuple(matrix[:2, 2]))
+    assert camera.center_px == pytest.approx(tuple(matrix[:2, 2]))
     assert camera.focal_px == pytest.approx((matrix[0, 0], matrix[1, 1]))
     for number, image in zip(numbers, capture.images, strict=True):  # the frame of that number
         off = np.abs(cv2.imread(str(image), cv2.IMREAD_COLOR_RGB).astype(float) - walk[1][number])
@@ -148,7 +148,7 @@ def test_each_frame_has_its_own_lens_in_newer_versions(source, walk):
     header = f"{HEADER}, fx, fy, cx, cy, distortion_center_x, distortion_center_y"
     (source / "odometry.csv").write_text(odometry(walk[0], header, ", 300.0, 301.0, 160.25, 120.75, , "))
     (camera,) = read_capture(source).cameras.values()
-    assert (camera.focal_px, camera.centre_px) == ((300, 301), (159.75, 120.25))
+    assert (camera.focal_px, camera.center_px) == ((300, 301), (159.75, 120.25))
     (source / "odometry.csv").write_text(odometry(walk[0], header, ", , , , , , "))  # empty: that of the matrix
     (camera,) = read_capture(source).cameras.values()
     assert camera.focal_px[0] == pytest.approx(default_intrinsics(SIZE)[0, 0])

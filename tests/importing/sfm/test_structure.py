@@ -100,9 +100,9 @@ def aligned(found, true):
 
 def errors(capture, true):
     """Per frame: position in m and rotation in degrees after alignment, and the extent of the true centres."""
-    centres = capture.world_from_cam[:, :3, 3]
-    scale, rotation, translation = aligned(centres, true[:, :3, 3])
-    position_m = np.linalg.norm(scale * rotation.apply(centres) + translation - true[:, :3, 3], axis=1)
+    centers = capture.world_from_cam[:, :3, 3]
+    scale, rotation, translation = aligned(centers, true[:, :3, 3])
+    position_m = np.linalg.norm(scale * rotation.apply(centers) + translation - true[:, :3, 3], axis=1)
     turns = (rotation * Rotation.from_matrix(capture.world_from_cam[:, :3, :3])).inv()
     rotation_deg = np.degrees((turns * Rotation.from_matrix(true[:, :3, :3])).magnitude())
     extent_m = np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))

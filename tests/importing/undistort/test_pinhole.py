@@ -21,13 +21,13 @@ LENSES = {
 }
 
 
-def camera(coefficients, focal_px=(250.0, 240.0), centre_px=(150.0, 125.0), lens=OpenCVModel):
-    return Camera(WIDTH, HEIGHT, focal_px, centre_px, lens(focal_px, centre_px, coefficients))
+def camera(coefficients, focal_px=(250.0, 240.0), center_px=(150.0, 125.0), lens=OpenCVModel):
+    return Camera(WIDTH, HEIGHT, focal_px, center_px, lens(focal_px, center_px, coefficients))
 
 
 def matrix_of(camera):
     return np.array(
-        [[camera.focal_px[0], 0, camera.centre_px[0]], [0, camera.focal_px[1], camera.centre_px[1]], [0, 0, 1]]
+        [[camera.focal_px[0], 0, camera.center_px[0]], [0, camera.focal_px[1], camera.center_px[1]], [0, 0, 1]]
     )
 
 
@@ -55,7 +55,7 @@ def test_a_fisheye_by_hand():
 def test_a_pinhole_shows_all_it_can_and_no_border(name):
     lens = camera(LENSES[name])
     pinhole = pinhole_of("a", lens)
-    assert (pinhole.width, pinhole.height, pinhole.centre_px) == (WIDTH, HEIGHT, lens.centre_px)
+    assert (pinhole.width, pinhole.height, pinhole.center_px) == (WIDTH, HEIGHT, lens.center_px)
     assert pinhole.distorted is None
     assert pinhole.focal_px[0] / pinhole.focal_px[1] == pytest.approx(250 / 240)
     columns, rows = sampled_at(lens.distorted, pinhole)
@@ -64,7 +64,7 @@ def test_a_pinhole_shows_all_it_can_and_no_border(name):
     assert columns.max() < WIDTH - 1 + 0.02
     assert rows.max() < HEIGHT - 1 + 0.02
     # A little wider, and it would look past the border; or, where the lens folds back, see a place in the mirror.
-    wider = Camera(WIDTH, HEIGHT, tuple(0.97 * f for f in pinhole.focal_px), pinhole.centre_px)
+    wider = Camera(WIDTH, HEIGHT, tuple(0.97 * f for f in pinhole.focal_px), pinhole.center_px)
     columns, rows = sampled_at(lens.distorted, wider)
     is_out = min(columns.min(), rows.min(), WIDTH - 1 - columns.max(), HEIGHT - 1 - rows.max()) < 0
     by_row, by_column = (np.gradient(seen.astype(float)) for seen in (columns, rows))
@@ -79,7 +79,7 @@ def test_pixels_come_from_where_their_rays_are_projected(name):
     lens = camera(told, (110.0, 110.0), lens=FisheyeModel) if is_fisheye else camera(told)
     pinhole = pinhole_of("a", lens)
     columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    rays = (np.stack((columns, rows), axis=-1).reshape(-1, 2) - pinhole.centre_px) / pinhole.focal_px
+    rays = (np.stack((columns, rows), axis=-1).reshape(-1, 2) - pinhole.center_px) / pinhole.focal_px
     expected = lens.distorted(rays).reshape(HEIGHT, WIDTH, 2)
     np.testing.assert_allclose(np.dstack(sampled_at(lens.distorted, pinhole)), expected, atol=1e-3)
     np.testing.assert_array_equal(
@@ -98,8 +98,8 @@ def test_a_pinhole_stays_itself():
 
 
 @pytest.mark.parametrize(
-    ("coefficients", "centre_px"), [((1e9, 0, 0, 0, 0), (150.0, 125.0)), ((0.1, 0, 0, 0, 0), (-50.0, 125.0))]
+    ("coefficients", "center_px"), [((1e9, 0, 0, 0, 0), (150.0, 125.0)), ((0.1, 0, 0, 0, 0), (-50.0, 125.0))]
 )
-def test_what_is_no_lens(coefficients, centre_px):
+def test_what_is_no_lens(coefficients, center_px):
     with pytest.raises(InputError, match="camera front: its distortion maps nothing into the image"):
-        pinhole_of("front", camera(coefficients, centre_px=centre_px))
+        pinhole_of("front", camera(coefficients, center_px=center_px))

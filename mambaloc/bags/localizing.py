@@ -1,4 +1,4 @@
-"""Localise a bag's pictures, and write their poses into another bag."""
+"""Localize a bag's pictures, and write their poses into another bag."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from mambaloc.bags.transforms import Chain, Gap, Matrix, Transforms, along
 from mambaloc.bags.writing import covariance_of, moved, pose_bag
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import Image
-from mambaloc.runtime.localisation import Localisation
-from mambaloc.runtime.localiser import Localiser
-from mambaloc.runtime.video import Followed, summarise
+from mambaloc.runtime.localization import Localization
+from mambaloc.runtime.localizer import Localizer
+from mambaloc.runtime.video import Followed, summarize
 
 Straightener = Callable[[BagCamera, tuple[int, int]], tuple[Matrix, Callable[[Image], Image]]]
 """Of a camera and a picture's size: intrinsics of pictures as the scene has them, and what makes a picture so."""
@@ -28,8 +28,8 @@ Straightener = Callable[[BagCamera, tuple[int, int]], tuple[Matrix, Callable[[Im
 _REMEDY = "Give pictures of the place, and a model that states radii or has a map of it."
 
 
-def localise_bag(
-    localiser: Localiser,
+def localize_bag(
+    localizer: Localizer,
     source: Path,
     out: Path,
     straightener: Straightener,
@@ -37,15 +37,15 @@ def localise_bag(
     intrinsics: ArrayLike | None = None,
     world: str = "map",
     frame: str | None = None,
-    on_picture: Callable[[Picture, Image, ArrayLike | None, Localisation], None] | None = None,
+    on_picture: Callable[[Picture, Image, ArrayLike | None, Localization], None] | None = None,
 ) -> Followed:
-    """Localise every picture of a bag, and write what a robot's filter takes: poses with covariances, at its times.
+    """Localize every picture of a bag, and write what a robot's filter takes: poses with covariances, at its times.
 
     A pose without radii says nothing to a filter, nor does that of a picture that does not look like the place: these
     are left out with a warning, as are pictures that are damaged. Ctrl-C ends it; what was found is written then.
 
     Args:
-        localiser: of the model.
+        localizer: of the model.
         source: the bag.
         out: the bag to write, as :func:`~mambaloc.bags.writing.pose_bag` takes it.
         straightener: removes the distortion that the bag's ``CameraInfo`` has.
@@ -56,9 +56,9 @@ def localise_bag(
         on_picture: is given each picture, it without distortion, its intrinsics, and what was found of it.
 
     Raises:
-        InputError: where a bag cannot be read or written, a picture cannot be localised, or none has a pose to write.
+        InputError: where a bag cannot be read or written, a picture cannot be localized, or none has a pose to write.
     """
-    found: list[Localisation] = []
+    found: list[Localization] = []
     left_out, written = Counter[str](), 0
     with open_bag(source) as bag, pose_bag(out, world) as write:
         topic = picture_topic(bag, topic)
@@ -67,9 +67,9 @@ def localise_bag(
         console = Console(stderr=True)
         try:
             for picture, image, matrix in track(
-                pictures, "Localising", bag.counts[topic], console=console, transient=True
+                pictures, "Localizing", bag.counts[topic], console=console, transient=True
             ):
-                found.append(localiser.localise(image, matrix))
+                found.append(localizer.localize(image, matrix))
                 if on_picture is not None:
                     on_picture(picture, image, matrix, found[-1])
                 stated = _stated(found[-1], body_of(picture))
@@ -85,10 +85,10 @@ def localise_bag(
             raise InputError(f"{source}: no picture of {topic} has a pose to write ({said}). {_REMEDY}")
     if said:
         warnings.warn(f"{out}: leaves out {said}.", InputWarning, stacklevel=2)
-    return summarise(localiser, found)
+    return summarize(localizer, found)
 
 
-def _stated(pose: Localisation, cam_from_body: Matrix | Gap) -> tuple[Matrix, Matrix, Matrix] | str:
+def _stated(pose: Localization, cam_from_body: Matrix | Gap) -> tuple[Matrix, Matrix, Matrix] | str:
     """Position, quaternion and covariance of a body, or why a filter should not have them."""
     covariance = covariance_of(pose)
     if pose.source is None:

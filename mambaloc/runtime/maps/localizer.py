@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import deprecated
 
 from mambaloc.errors import InputError
 from mambaloc.images import Image, as_rgb
@@ -42,7 +43,7 @@ _SHARED = 1.25  # of variances: neighbouring matches share errors; chosen on fra
 
 
 @dataclass(frozen=True)
-class MapLocalisation:
+class MapLocalization:
     """Where one picture was taken, ``world_from_cam``, and how sure that is.
 
     Shape:
@@ -81,8 +82,8 @@ class _Matches(NamedTuple):
     is_distinctive: NDArray[np.bool_]
 
 
-class MapLocaliser:
-    """Localise pictures in a map, without torch and without a network.
+class MapLocalizer:
+    """Localize pictures in a map, without torch and without a network.
 
     The points that most frames see are matched at once, RANSAC finds a pose, and every point is searched again around
     where that pose projects it to.
@@ -108,10 +109,10 @@ class MapLocaliser:
         drift = sparse_map.drift if len(sparse_map.drift) else np.zeros((len(sparse_map.key_poses), 6))
         self.drift = Drift(sparse_map.key_poses[: len(drift)], drift, sparse_map.nugget)
 
-    def localise(
+    def localize(
         self, image: Image, intrinsics: ArrayLike | None = None, prior: CameraPose | None = None
-    ) -> MapLocalisation:
-        """Localise one picture.
+    ) -> MapLocalization:
+        """Localize one picture.
 
         Args:
             image: RGB (H, W, 3) or grey (H, W), ``uint8``, of any size, without distortion.
@@ -122,10 +123,10 @@ class MapLocaliser:
             InputError: for another kind of array, intrinsics that do not fit the picture, or none for a picture of
                 another shape than the map's.
         """
-        return self.localise_features(self.features(image, intrinsics), prior)
+        return self.localize_features(self.features(image, intrinsics), prior)
 
     def features(self, image: Image, intrinsics: ArrayLike | None = None) -> Features:
-        """Find a picture's keypoints as the map's were found; arguments and errors are those of :meth:`localise`."""
+        """Find a picture's keypoints as the map's were found; arguments and errors are those of :meth:`localize`."""
         rgb = as_rgb(image)
         matrix = self._intrinsics(rgb) if intrinsics is None else np.asarray(intrinsics, np.float64)
         check_intrinsics(matrix, (rgb.shape[1], rgb.shape[0]))
@@ -133,8 +134,8 @@ class MapLocaliser:
         found = detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0])
         return self.map.lens.straighten(found) if self._is_own_camera(found) else found
 
-    def localise_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalisation:
-        """Localise a picture whose keypoints :meth:`features` found."""
+    def localize_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalization:
+        """Localize a picture whose keypoints :meth:`features` found."""
         best, is_clear = unambiguous(features.descriptors @ self._often_descriptors, _RATIO)
         rng = np.random.default_rng(self.seed)
         start = ransac_pose(self._often_m[best[is_clear]], features.rays[is_clear], self._near, rng)
@@ -146,7 +147,14 @@ class MapLocaliser:
         both = (found, self._settled(features, start))
         return max(both, key=lambda each: (each.is_accepted, each.probability, each.inliers))
 
-    def _settled(self, features: Features, start: CameraPose | None) -> MapLocalisation:
+    @deprecated("MapLocalizer.localise is now localize. The old name is removed in the next release.")
+    def localise(
+        self, image: Image, intrinsics: ArrayLike | None = None, prior: CameraPose | None = None
+    ) -> MapLocalization:
+        """Localize one image. Deprecated: removed in the next release."""
+        return self.localize(image, intrinsics, prior)
+
+    def _settled(self, features: Features, start: CameraPose | None) -> MapLocalization:
         """Search around a pose and refine it, twice."""
         if start is None:
             return _nowhere()
@@ -167,7 +175,7 @@ class MapLocaliser:
         focal_off = focal[0] if is_another_focal_length(*focal) else None
         probability = evidence.probability if focal_off is None else 0.0
         given, unsure = self.drift.to_given(pose)
-        return MapLocalisation(
+        return MapLocalization(
             given.position_m,
             quaternion_from_matrix(given.rotation),
             int(is_inlier.sum()),
@@ -265,5 +273,5 @@ def _deviation_m(covariance: Floats) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
 
 
-def _nowhere() -> MapLocalisation:
-    return MapLocalisation(np.full(3, np.nan), np.full(4, np.nan), 0, False, np.full((6, 6), np.nan))
+def _nowhere() -> MapLocalization:
+    return MapLocalization(np.full(3, np.nan), np.full(4, np.nan), 0, False, np.full((6, 6), np.nan))

@@ -1,4 +1,4 @@
-"""A drive in one bag, imported, trained on and localised into another: errors are those of evaluate.py."""
+"""A drive in one bag, imported, trained on and localized into another: errors are those of evaluate.py."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def evaluated(path: Path) -> dict[int, tuple[float, float]]:
         }
 
 
-def localised(path: Path) -> dict[int, tuple[float, float]]:
+def localized(path: Path) -> dict[int, tuple[float, float]]:
     """The same of a bag's poses, against where the camera was."""
     truth, errors = true_poses(), {}
     for message in messages(path, TOPIC):
@@ -112,7 +112,7 @@ def test_a_networks_errors_in_the_optical_frame_are_those_of_evaluate(drive, tmp
     """Guess: float32 in ONNX Runtime and in PyTorch agree to 1e-6 m and rad. They do, to 1e-7 and 2e-7."""
     tool("localize", drive / "bundle", drive / "drive", "--out", tmp_path / name, "--no-map")
     assert is_bag(tmp_path / name)
-    expected, found = evaluated(drive / "evaluated/predictions.csv"), localised(tmp_path / name)
+    expected, found = evaluated(drive / "evaluated/predictions.csv"), localized(tmp_path / name)
     common = sorted(expected.keys() & found.keys())
     assert len(common) > len(expected) / 2  # what does not look like the place is left out
     off = np.array([found[row] for row in common]) - [expected[row] for row in common]
@@ -125,7 +125,7 @@ def test_a_maps_errors_in_the_optical_frame_are_those_of_evaluate(drive, tmp_pat
     map_file = drive / "run/map/map.safetensors"
     tool("localize", map_file, drive / "drive", "--out", tmp_path / "found")
     measured = measure_map(map_file, Checkpoint.read(drive / "run/checkpoints/last.ckpt").data())
-    table, found = measured.alone.table, localised(tmp_path / "found")
+    table, found = measured.alone.table, localized(tmp_path / "found")
     numbers = [int(path.stem) for path in measured.frames.image_paths]
     accepted = [row for row in np.flatnonzero(measured.alone.is_accepted) if numbers[row] in found]
     assert len(accepted) == measured.alone.is_accepted.sum() > 3

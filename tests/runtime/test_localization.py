@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mambaloc.runtime import Localisation, combined
-from mambaloc.runtime.maps import MapLocalisation
+from mambaloc.runtime import Localization, combined
+from mambaloc.runtime.maps import MapLocalization
 from mambaloc.runtime.maps.radii import covariance_radius
 
-NETWORK = Localisation(np.array([1.0, 2, 3]), np.array([1.0, 0, 0, 0]), 0.01, 0.5, 9.0, 1.4)
+NETWORK = Localization(np.array([1.0, 2, 3]), np.array([1.0, 0, 0, 0]), 0.01, 0.5, 9.0, 1.4)
 COVARIANCE = np.diag([0.01, 0.01, 0.01, 0.0004, 0.0004, 0.0004])  # 0.1 m and 0.02 rad each way
 
 
 def found(is_accepted):
-    return MapLocalisation(np.array([4.0, 5, 6]), np.array([0.6, 0.8, 0, 0]), 23, is_accepted, COVARIANCE)
+    return MapLocalization(np.array([4.0, 5, 6]), np.array([0.6, 0.8, 0, 0]), 23, is_accepted, COVARIANCE)
 
 
 def test_an_accepted_pose_of_the_map_is_the_answer():

@@ -3,7 +3,7 @@
  * file runs in a browser's worker and in Node.
  */
 
-import { MapLocaliser } from "./map_localiser.js";
+import { MapLocalizer } from "./map_localizer.js";
 import { Network } from "./network.js";
 
 const CONTRACT_VERSION = 1;
@@ -13,7 +13,7 @@ const RIGHT = { m: 0.2, deg: 5 };
 const LEVEL_SIGMAS = 1.2815515655446004; // nine tenths of a normal variable are below
 
 /** A network, and a map. */
-export class Localiser {
+export class Localizer {
   #network;
   #map;
 
@@ -32,22 +32,22 @@ export class Localiser {
   static async create(ort, modelBytes, contract, map = null, options = {}) {
     checkContract(contract);
     const network = await Network.create(ort, modelBytes, contract, options);
-    return new Localiser(network, map && new MapLocaliser(map));
+    return new Localizer(network, map && new MapLocalizer(map));
   }
 
   /**
-   * Localise one picture: the map's pose where it is accepted or likelier to be right than the network's, which is the
+   * Localize one picture: the map's pose where it is accepted or likelier to be right than the network's, which is the
    * answer otherwise.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the training camera's unless given.
-   * @returns as {@link Network#localise}; and `source`, "map" or "network"; `network`, its own answer; where there is a
+   * @returns as {@link Network#localize}; and `source`, "map" or "network"; `network`, its own answer; where there is a
    *   map, `map`, its answer or null, and `map_ms`. Where the map's pose is accepted, the radii are from its covariance.
    */
-  async localise(image, intrinsics = null) {
-    const network = await this.#network.localise(image, intrinsics);
+  async localize(image, intrinsics = null) {
+    const network = await this.#network.localize(image, intrinsics);
     if (!this.#map) return { ...network, source: "network", network };
     const start = performance.now();
-    const map = this.#map.localise(image, intrinsics, network);
+    const map = this.#map.localize(image, intrinsics, network);
     const both = { ...network, source: "network", network, map, map_ms: performance.now() - start };
     if (!map?.isAccepted && !(map?.probability > probabilityOf(network))) return both;
     const { position_m, quaternion_wxyz } = map;
@@ -58,7 +58,7 @@ export class Localiser {
   }
 }
 
-/** That a network's pose is right, as `mambaloc/runtime/localisation.py` has it. */
+/** That a network's pose is right, as `mambaloc/runtime/localization.py` has it. */
 function probabilityOf({ position_radius_m, rotation_radius_deg, unfamiliarity }) {
   if (unfamiliarity !== undefined && !(unfamiliarity <= 1)) return 0;
   if (position_radius_m === undefined || rotation_radius_deg === undefined) return UNSTATED;

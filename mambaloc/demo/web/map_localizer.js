@@ -1,4 +1,4 @@
-/** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localiser.py` finds it. No DOM. */
+/** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localizer.py` finds it. No DOM. */
 
 import { focalScale, project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
 import { LEAST_PROBABILITY, MOST_DEVIATION, isAnotherFocalLength, occupiedCells, probabilityOf } from "./acceptance.js";
@@ -22,8 +22,8 @@ const SHARED = 1.25; // of variances: neighbouring matches share errors
 const LENS_STEPS = 10;
 const SAME = 0.01; // of the width, by which a camera may differ from the map's and still be its own
 
-/** Localises pictures in a map. */
-export class MapLocaliser {
+/** Localizes pictures in a map. */
+export class MapLocalizer {
   #map;
   #seed;
   #near; // in the plane at depth 1
@@ -47,7 +47,7 @@ export class MapLocaliser {
   }
 
   /**
-   * Localise one picture.
+   * Localize one picture.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the map's camera unless given.
    * @param prior a pose to search around where all points at once find none to accept.
@@ -55,7 +55,7 @@ export class MapLocaliser {
    *   `focalScale` as in Python, and `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers.
    *   Null where there is no pose, or the picture has another shape than the map's, so that its camera is unknown.
    */
-  localise(image, intrinsics = null, prior = null) {
+  localize(image, intrinsics = null, prior = null) {
     const camera = intrinsics ? cameraOf(intrinsics.flat()) : this.#cameraFor(image);
     if (!camera) return null;
     const grey = greyPicture(image, this.#map.intrinsics.fx / camera.fx);

@@ -1,4 +1,4 @@
-"""One localiser of a network and a sparse map: which answers, and what becomes of a map that cannot be used.
+"""One localizer of a network and a sparse map: which answers, and what becomes of a map that cannot be used.
 
 The network knows another scene; for what is tested here it only has to answer.
 """
@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import read_image
-from mambaloc.runtime import Localiser
-from mambaloc.runtime.maps import MapLocaliser, SparseMap
+from mambaloc.runtime import Localizer
+from mambaloc.runtime.maps import MapLocalizer, SparseMap
 
 TOOL = Path(__file__).parents[2] / "tools" / "localize.py"
 GREY = np.full((120, 160, 3), 128, np.uint8)
@@ -31,7 +31,7 @@ def network(bundle_of_tensors):
 
 @pytest.fixture
 def both(network, map_of_den):
-    return Localiser(network, 1, map_of_den)
+    return Localizer(network, 1, map_of_den)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def check_is_of_the_map(found, frame):
 
 
 def test_the_map_answers_where_it_is_sure(both, frame, map_of_den):
-    found, alone = both.localise(frame), MapLocaliser(SparseMap.load(map_of_den)).localise(read_image(frame))
+    found, alone = both.localize(frame), MapLocalizer(SparseMap.load(map_of_den)).localize(read_image(frame))
     check_is_of_the_map(found, frame)
     np.testing.assert_array_equal(found.position_m, alone.position_m)
     np.testing.assert_array_equal(found.covariance, alone.covariance)
@@ -73,7 +73,7 @@ def test_the_map_answers_where_it_is_sure(both, frame, map_of_den):
 
 
 def test_the_network_answers_where_the_map_does_not(both, network):
-    found, alone = both.localise(GREY), Localiser(network, 1).localise(GREY)
+    found, alone = both.localize(GREY), Localizer(network, 1).localize(GREY)
     assert (found.source, found.inliers, found.covariance) == ("network", 0, None)
     np.testing.assert_array_equal(found.position_m, alone.position_m)
     np.testing.assert_array_equal(found.quaternion, alone.quaternion)
@@ -82,34 +82,34 @@ def test_the_network_answers_where_the_map_does_not(both, network):
 
 def test_the_networks_pose_is_what_the_map_searches_around(both, frame, monkeypatch):
     priors = []
-    monkeypatch.setattr(MapLocaliser, "localise", lambda self, image, k, prior: priors.append(prior) or pytest.skip)
+    monkeypatch.setattr(MapLocalizer, "localize", lambda self, image, k, prior: priors.append(prior) or pytest.skip)
     with pytest.raises(AttributeError):  # what stands in for an answer is none
-        both.localise(frame)
+        both.localize(frame)
     monkeypatch.undo()
-    alone = both._network.localise(read_image(frame))
+    alone = both._network.localize(read_image(frame))
     np.testing.assert_array_equal(priors[0].position_m, alone.position_m)
     expected = Rotation.from_quat(alone.quaternion, scalar_first=True).as_matrix()
     np.testing.assert_allclose(priors[0].rotation, expected, atol=1e-6)
 
 
 def test_a_bundle_brings_its_map(bundle, frame, map_of_den):
-    check_is_of_the_map(Localiser(bundle, 1).localise(frame), frame)
-    assert Localiser(bundle, 1).scene == "7scenes/heads"
-    assert Localiser(bundle, 1, sparse_map=False).localise(frame).source == "network"
-    assert Localiser(bundle / "model.onnx", 1).sparse_map is None  # a model's file is that model alone
+    check_is_of_the_map(Localizer(bundle, 1).localize(frame), frame)
+    assert Localizer(bundle, 1).scene == "7scenes/heads"
+    assert Localizer(bundle, 1, sparse_map=False).localize(frame).source == "network"
+    assert Localizer(bundle / "model.onnx", 1).sparse_map is None  # a model's file is that model alone
     loaded = SparseMap.load(map_of_den)
-    assert Localiser(bundle / "model.onnx", 1, loaded).sparse_map is loaded
+    assert Localizer(bundle / "model.onnx", 1, loaded).sparse_map is loaded
 
 
-def test_a_map_localises_without_a_network(map_of_den, frame):
-    localiser = Localiser(map_of_den)
-    assert (localiser.contract, localiser.scene) == (None, "den")
-    check_is_of_the_map(localiser.localise(frame), frame)
-    lost = localiser.localise(GREY)
+def test_a_map_localizes_without_a_network(map_of_den, frame):
+    localizer = Localizer(map_of_den)
+    assert (localizer.contract, localizer.scene) == (None, "den")
+    check_is_of_the_map(localizer.localize(frame), frame)
+    lost = localizer.localize(GREY)
     assert lost.source is None
     assert np.isnan(lost.position_m).all()
     with pytest.raises(InputError, match="its shape differs from the map's pictures of 160x120"):
-        localiser.localise(np.zeros((72, 72, 3), np.uint8))
+        localizer.localize(np.zeros((72, 72, 3), np.uint8))
 
 
 # --- other cameras ----------------------------------------------------------------------------------------------------
@@ -121,32 +121,32 @@ def test_a_picture_of_another_shape_needs_its_intrinsics(both, frame, map_of_den
     with pytest.warns(
         InputWarning, match=r"160x100: its shape differs .* The network answers without the map\."
     ) as said:
-        answers = [both.localise(cut) for _ in range(3)]
+        answers = [both.localize(cut) for _ in range(3)]
     assert [each.source for each in answers] == ["network"] * 3
     assert "\n" not in str(said[0].message)
-    check_is_of_the_map(both.localise(cut, SparseMap.load(map_of_den).intrinsics), frame)
+    check_is_of_the_map(both.localize(cut, SparseMap.load(map_of_den).intrinsics), frame)
 
 
 def test_it_is_said_once(both):
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("default")
         for _ in range(3):
-            both.localise(np.zeros((100, 160, 3), np.uint8))
+            both.localize(np.zeros((100, 160, 3), np.uint8))
     assert len(said) == 1
 
 
 @pytest.mark.parametrize("intrinsics", [np.eye(3), np.zeros(3), np.full((3, 3), np.nan)])
 def test_a_camera_that_cannot_be_leaves_the_network(both, frame, intrinsics, map_of_den):
     with pytest.warns(InputWarning, match=r"intrinsics .*: cannot be the camera .* without the map\."):
-        assert both.localise(frame, intrinsics).source == "network"
+        assert both.localize(frame, intrinsics).source == "network"
     with pytest.raises(InputError, match="cannot be the camera"):
-        Localiser(map_of_den).localise(frame, intrinsics)
+        Localizer(map_of_den).localize(frame, intrinsics)
 
 
 def test_a_wrong_camera_is_not_accepted(both, frame):
     """Twice the focal length: matches agree with no pose of such a camera."""
     wrong = np.array([[288.0, 0, 79.5], [0, 288, 59.5], [0, 0, 1]])
-    assert both.localise(frame, wrong).source == "network"
+    assert both.localize(frame, wrong).source == "network"
 
 
 @pytest.mark.parametrize(("scale", "said"), [(1 / 1.1, "10 % too short"), (1.1, "10 % too long")])
@@ -154,7 +154,7 @@ def test_a_focal_length_that_is_a_tenth_off_is_said(scale, said, map_of_den, fra
     """A tenth moves the pose by decimetres, which nothing else shows."""
     wrong = np.array([[144.0 * scale, 0, 79.5], [0, 144 * scale, 59.5], [0, 0, 1]])
     with pytest.warns(InputWarning, match=f"their focal length is about {said}"):
-        found = Localiser(map_of_den).localise(frame, wrong)
+        found = Localizer(map_of_den).localize(frame, wrong)
     assert (found.source, found.covariance) == (None, None)
     assert found.focal_scale == pytest.approx(1 / scale, abs=0.05)
 
@@ -179,18 +179,18 @@ def damage(path, how):
 def test_a_bad_map_in_a_bundle_leaves_the_network(how, message, bundle, frame):
     damage(bundle / "map.safetensors", how)
     with pytest.warns(InputWarning, match=rf"map\.safetensors: .*{message}.*The network answers") as said:
-        localiser = Localiser(bundle, 1)
+        localizer = Localizer(bundle, 1)
     assert "\n" not in str(said[0].message)
-    assert localiser.localise(frame).source == "network"
+    assert localizer.localize(frame).source == "network"
     with pytest.raises(InputError, match=message):  # named, it is a mistake
-        Localiser(bundle / "model.onnx", 1, bundle / "map.safetensors")
+        Localizer(bundle / "model.onnx", 1, bundle / "map.safetensors")
     with pytest.raises(InputError, match=message):
-        Localiser(bundle / "map.safetensors")
+        Localizer(bundle / "map.safetensors")
 
 
 def test_a_map_that_is_not_there_is_refused(network, tmp_path):
     with pytest.raises(InputError, match=r"none\.safetensors: cannot be read"):
-        Localiser(network, 1, tmp_path / "none.safetensors")
+        Localizer(network, 1, tmp_path / "none.safetensors")
 
 
 # --- the tool ---------------------------------------------------------------------------------------------------------
@@ -240,7 +240,7 @@ def test_the_tool_says_in_a_line_what_keeps_the_map_from_being_used(bundle, pict
 def test_the_tool_refuses_in_a_line(map_of_den, pictures, tmp_path, capsys):
     for words, message in (
         ((map_of_den, pictures, "--intrinsics", "1,2"), "1,2: give FX,FY,CX,CY in pixels"),
-        ((map_of_den, pictures / "b.png"), "none of its 1 frames was localised"),
+        ((map_of_den, pictures / "b.png"), "none of its 1 frames was localized"),
         ((tmp_path / "map.safetensors", pictures), "cannot be read"),
     ):
         with pytest.raises(SystemExit) as ended:

@@ -18,7 +18,7 @@ from mambaloc.export import contract_of, export_onnx
 from mambaloc.geometry import canonical
 from mambaloc.images import as_rgb, read_image
 from mambaloc.models.student import LitStudent
-from mambaloc.runtime import Contract, Localiser, PoseFilter, Preprocessing, frames_of, smooth
+from mambaloc.runtime import Contract, Localizer, PoseFilter, Preprocessing, frames_of, smooth
 from mambaloc.runtime.sources import PICTURES_HZ
 from mambaloc.runtime.video import follow
 
@@ -48,21 +48,21 @@ def picture(height=90, width=120, seed=0):
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
-def test_a_picture_is_localised_as_training_sees_it(student, model, tmp_path):
+def test_a_picture_is_localized_as_training_sees_it(student, model, tmp_path):
     rgb = picture()
     cv2.imwrite(str(tmp_path / "a.png"), rgb[..., ::-1])
     small = cv2.resize(rgb, (64, 48), interpolation=cv2.INTER_AREA)  # as the cache decodes frames
     with torch.no_grad():
         expected = student(center_crop(torch.from_numpy(small.transpose(2, 0, 1))[None], student.image_size))
     for given in (rgb, tmp_path / "a.png", str(tmp_path / "a.png")):
-        found = Localiser(model).localise(given)
+        found = Localizer(model).localize(given)
         np.testing.assert_allclose(found.position_m, expected.position_m[0], atol=1e-4)
         np.testing.assert_allclose(found.quaternion, canonical(expected.quaternion)[0], atol=1e-5)
         assert found.latency_s > 0
 
 
 def test_the_contract_travels_with_the_model(student, model):
-    contract = Localiser(model).contract
+    contract = Localizer(model).contract
     assert contract == contract_of(student, DATA)
     assert contract.preprocessing == Preprocessing(48, (40, 56))
     assert contract.trained == {"commit": "abc", "seed": 3}
@@ -73,9 +73,9 @@ def test_the_runtime_needs_no_torch(model, map_of_den, tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), picture())
     program = (
         "import sys\nfor name in ('torch', 'rich', 'filelock', 'yaml', 'onnx'): sys.modules[name] = None\n"
-        "import mambaloc\nfrom mambaloc.runtime import Localiser\n"
-        f"localiser = Localiser({str(model)!r}, sparse_map={str(map_of_den)!r})\n"
-        f"print(localiser.localise({str(tmp_path / 'a.png')!r}).position_m.tolist())\n"
+        "import mambaloc\nfrom mambaloc.runtime import Localizer\n"
+        f"localizer = Localizer({str(model)!r}, sparse_map={str(map_of_den)!r})\n"
+        f"print(localizer.localize({str(tmp_path / 'a.png')!r}).position_m.tolist())\n"
         "heavy = {'lightning', 'timm', 'torchvision'} & set(sys.modules)\nassert not heavy, heavy"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
@@ -89,11 +89,11 @@ def test_the_runtime_needs_no_torch(model, map_of_den, tmp_path):
 def test_grey_and_transparent_pictures_are_rgb(model, tmp_path):
     grey = picture()[..., 0]
     as_three = np.repeat(grey[..., None], 3, axis=-1)
-    expected = Localiser(model).localise(as_three)
+    expected = Localizer(model).localize(as_three)
     cv2.imwrite(str(tmp_path / "grey.png"), grey)
     cv2.imwrite(str(tmp_path / "rgba.png"), np.dstack([as_three, np.full_like(grey, 7)]))
     for given in (grey, grey[..., None], np.dstack([as_three, grey]), tmp_path / "grey.png", tmp_path / "rgba.png"):
-        np.testing.assert_array_equal(Localiser(model).localise(given).position_m, expected.position_m)
+        np.testing.assert_array_equal(Localizer(model).localize(given).position_m, expected.position_m)
 
 
 def test_a_turned_photograph_is_made_upright(tmp_path):
@@ -126,7 +126,7 @@ def test_what_is_no_picture(content, message, model, tmp_path):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(InputError, match=message) as error:
-        Localiser(model).localise(path)
+        Localizer(model).localize(path)
     assert str(path) in str(error.value)
 
 
@@ -138,12 +138,12 @@ def test_arrays_of_other_kinds_are_refused(array):
 
 def test_a_picture_too_narrow_for_the_crop_is_refused(model):
     with pytest.raises(InputError, match="does not hold the model's crop of 56x40"):
-        Localiser(model).localise(picture(120, 120))
+        Localizer(model).localize(picture(120, 120))
 
 
-def test_huge_and_tiny_pictures_are_localised(model):
+def test_huge_and_tiny_pictures_are_localized(model):
     for size in ((3000, 4000), (6, 8)):
-        assert np.isfinite(Localiser(model).localise(picture(*size)).position_m).all()
+        assert np.isfinite(Localizer(model).localize(picture(*size)).position_m).all()
 
 
 # --- models of every kind --------------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def test_huge_and_tiny_pictures_are_localised(model):
 def test_what_is_no_model(model, tmp_path):
     def refused(path, message):
         with pytest.raises(InputError, match=message) as error:
-            Localiser(path)
+            Localizer(path)
         assert "\n" not in str(error.value)
 
     refused(tmp_path / "nothing.onnx", "no such model")
@@ -166,7 +166,7 @@ def test_what_is_no_model(model, tmp_path):
     refused(tmp_path / "plain.onnx", "carries no contract")
     other = onnx.load(model)
     for change in ({"crop": (8, 8)}, {"in_model": True}):
-        contract = Localiser(model).contract
+        contract = Localizer(model).contract
         told = replace(contract, preprocessing=replace(contract.preprocessing, **change))
         other.metadata_props[0].value = told.to_json()
         onnx.save(other, tmp_path / "other.onnx")
@@ -262,14 +262,14 @@ def test_a_cameras_times_are_the_clocks(monkeypatch):
     assert [frame.time_s for frame in frames_of("0")[0]] == pytest.approx([0, 0.1, 0.4, 0.5])
 
 
-def test_a_source_is_localised_frame_by_frame(model, tmp_path):
+def test_a_source_is_localized_frame_by_frame(model, tmp_path):
     for name, seed in (("a.png", 0), ("b.png", 1)):
         cv2.imwrite(str(tmp_path / name), picture(seed=seed)[..., ::-1])
-    localiser = Localiser(model)
-    found = list(localiser.localise_each(tmp_path))
+    localizer = Localizer(model)
+    found = list(localizer.localize_each(tmp_path))
     assert [time_s for time_s, _ in found] == [0, 1 / PICTURES_HZ]
-    np.testing.assert_array_equal(found[1][1].position_m, localiser.localise(picture(seed=1)).position_m)
-    slower = localiser.localise_each(frames_of(tmp_path, pictures_hz=8)[0])
+    np.testing.assert_array_equal(found[1][1].position_m, localizer.localize(picture(seed=1)).position_m)
+    slower = localizer.localize_each(frames_of(tmp_path, pictures_hz=8)[0])
     assert [time_s for time_s, _ in slower] == [0, 1 / 8]
 
 
@@ -278,7 +278,7 @@ def test_what_was_found_before_a_bad_picture_is_kept(model, tmp_path):
     (tmp_path / "b.png").write_bytes(b"noise")
     out = tmp_path / "poses.tum"
     with pytest.raises(InputError, match=r"b\.png: image cannot be decoded"):
-        follow(Localiser(model), str(tmp_path), out)
+        follow(Localizer(model), str(tmp_path), out)
     assert len(out.read_text().splitlines()) == 2  # a comment, and the first
 
 
@@ -293,7 +293,7 @@ def pictures(tmp_path):
 
 @pytest.mark.parametrize("filtering", ["causal", "smooth"])
 def test_a_filters_poses_are_written(filtering, model, pictures, tmp_path):
-    found = [pose for _, pose in Localiser(model).localise_each(pictures)]
+    found = [pose for _, pose in Localizer(model).localize_each(pictures)]
     positions_m, quaternions = (np.stack([getattr(p, of) for p in found]) for of in ("position_m", "quaternion"))
     times_s = np.arange(40) / 30
     if filtering == "smooth":
@@ -301,7 +301,7 @@ def test_a_filters_poses_are_written(filtering, model, pictures, tmp_path):
     else:
         keep = PoseFilter()
         expected = [keep.update(*pose) for pose in zip(times_s, positions_m, quaternions, strict=True)]
-    done = follow(Localiser(model), str(pictures), tmp_path / "poses.tum", filtering)
+    done = follow(Localizer(model), str(pictures), tmp_path / "poses.tum", filtering)
     written = np.loadtxt(tmp_path / "poses.tum")
     assert (done.count, done.outliers) == (40, sum(pose.is_outlier for pose in expected))
     np.testing.assert_allclose(written[:, 0], times_s, atol=1e-8)  # what the filter was given
@@ -313,23 +313,23 @@ def test_a_filters_poses_are_written(filtering, model, pictures, tmp_path):
 
 @pytest.mark.parametrize("filtering", [None, "causal", "smooth"])
 def test_ctrl_c_writes_what_was_found(filtering, model, pictures, tmp_path, monkeypatch):
-    localiser = Localiser(model)
-    localise, left = localiser.localise, iter(range(5))
+    localizer = Localizer(model)
+    localize, left = localizer.localize, iter(range(5))
 
     def interrupted(image, *how):
         if next(left, None) is None:
             raise KeyboardInterrupt
-        return localise(image, *how)
+        return localize(image, *how)
 
-    monkeypatch.setattr(localiser, "localise", interrupted)
-    assert follow(localiser, str(pictures), tmp_path / "poses.tum", filtering).count == 5
+    monkeypatch.setattr(localizer, "localize", interrupted)
+    assert follow(localizer, str(pictures), tmp_path / "poses.tum", filtering).count == 5
     assert np.loadtxt(tmp_path / "poses.tum").shape == (5, 8)
 
 
 def test_where_poses_go_is_asked_before_the_work(model, tmp_path):
     for out in (tmp_path, tmp_path / "none/poses.tum"):
         with pytest.raises(InputError, match=r"--out .*: there is no folder"):
-            follow(Localiser(model), "nothing at all", out)
+            follow(Localizer(model), "nothing at all", out)
 
 
 def test_what_is_no_source(tmp_path):

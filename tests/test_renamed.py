@@ -1,0 +1,58 @@
+"""Names that were renamed are importable for one release, and warn."""
+
+import importlib
+
+import pytest
+import torch
+
+from mambaloc.nn import PositionScale
+from mambaloc.runtime import Localizer
+from mambaloc.runtime.maps import MapLocalizer
+
+RENAMED = [
+    ("mambaloc.runtime", "Localiser", "Localizer"),
+    ("mambaloc.runtime", "Localisation", "Localization"),
+    ("mambaloc.runtime.localiser", "Localiser", "Localizer"),
+    ("mambaloc.runtime.localisation", "Localisation", "Localization"),
+    ("mambaloc.runtime.maps", "MapLocaliser", "MapLocalizer"),
+    ("mambaloc.runtime.maps", "MapLocalisation", "MapLocalization"),
+    ("mambaloc.nn", "Discretisation", "Discretization"),
+    ("mambaloc.metrics", "summarise", "summarize"),
+    ("mambaloc.metrics", "summarise_errors", "summarize_errors"),
+]
+
+
+@pytest.mark.parametrize(("module", "old", "new"), RENAMED)
+def test_old_names_are_the_new_ones_and_warn(module, old, new):
+    package = importlib.import_module(module)
+    with pytest.warns(DeprecationWarning, match=rf"{module}\.{old} is now {new}\."):
+        found = getattr(package, old)
+    assert found is getattr(package, new)
+    assert old not in dir(package)
+
+
+@pytest.mark.parametrize("module", sorted({module for module, _, _ in RENAMED}))
+def test_other_names_are_still_missing(module):
+    with pytest.raises(AttributeError, match=f"module '{module}' has no attribute 'nothing'"):
+        _ = importlib.import_module(module).nothing
+
+
+@pytest.mark.parametrize(
+    ("kind", "old", "new", "arguments"),
+    [
+        (Localizer, "localise", "localize", ("image", "intrinsics", True)),
+        (Localizer, "localise_each", "localize_each", ("source", "intrinsics", True)),
+        (MapLocalizer, "localise", "localize", ("image", "intrinsics", "prior")),
+    ],
+)
+def test_old_methods_call_the_new_ones_and_warn(monkeypatch, kind, old, new, arguments):
+    monkeypatch.setattr(kind, new, lambda self, *given: given)
+    with pytest.warns(DeprecationWarning, match=rf"{kind.__name__}\.{old} is now {new}\."):
+        assert getattr(kind.__new__(kind), old)(*arguments) == arguments
+
+
+def test_positions_are_normalized_by_the_old_name():
+    scale, position_m = PositionScale(), torch.tensor([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0]])
+    scale.fit(position_m)
+    with pytest.warns(DeprecationWarning, match="PositionScale.normalise is now normalize"):
+        torch.testing.assert_close(scale.normalise(position_m), scale.normalize(position_m))
