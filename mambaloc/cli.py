@@ -126,7 +126,7 @@ class RecipeCLI(LightningCLI):
             )
         if str(config.trainer.precision) in ("16-true", "bf16-true"):
             raise InputError(
-                f"trainer.precision {config.trainer.precision}: pictures and poses have 32 bits, so weights must. "
+                f"trainer.precision {config.trainer.precision}: images and poses have 32 bits, so weights must. "
                 f"Give {str(config.trainer.precision).replace('true', 'mixed')}."
             )
         if config.data.scenes and config.map.enabled:

@@ -1,4 +1,4 @@
-"""Which way round a picture is stored: the orientation tag of its EXIF, read, applied and taken out.
+"""Which way round an image is stored: the orientation tag of its EXIF, read, applied and taken out.
 
 Values are those of tag 0x0112 in EXIF 2.32: 1 is upright, and of 2 to 8 each is another mirror or turn of the pixels.
 """
@@ -53,7 +53,7 @@ def orientation_of(data: bytes) -> int:
 
 
 def head_of(path: Path) -> bytes:
-    """The first bytes of a picture's file, which hold its orientation; none where it cannot be read."""
+    """The first bytes of an image's file, which hold its orientation; none where it cannot be read."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
@@ -63,7 +63,7 @@ def head_of(path: Path) -> bytes:
 
 
 def unclear_pose(head: bytes) -> str | None:
-    """The rule that a posed picture breaks where an orientation leaves open which of its pixels the pose means."""
+    """The rule that a posed image breaks where an orientation leaves open which of its pixels the pose means."""
     if (orientation := orientation_of(head)) == 1:
         return None
     return (

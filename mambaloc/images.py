@@ -21,9 +21,9 @@ Image = NDArray[np.uint8]
 """RGB, (H, W, 3)."""
 
 Counts = tuple[int, int]
-"""What a 16-bit picture has where 8 bits are black, and where they are white."""
+"""What a 16-bit image has where 8 bits are black, and where they are white."""
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".heic", ".heif")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".heic", ".heif")
 """Suffixes of files that are taken for images."""
 
 LUMA = (0.299, 0.587, 0.114)
@@ -39,7 +39,7 @@ END_BYTES = 4096
 """How far from a file's end its format's last marker may lie."""
 
 FULL_COUNTS: Counts = (0, 65535)
-"""Of a picture that uses the whole of its 16 bits, as photographs do."""
+"""Of an image that uses the whole of its 16 bits, as photographs do."""
 
 _STRAYS = 0.001  # of all pixels, at either end
 
@@ -50,31 +50,31 @@ _HEIF = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"mif2",
 _AVIF = (b"avif", b"avis")
 
 
-def pictures(folder: Path) -> list[Path]:
-    """The pictures in a folder in natural order, without depth; none where there is no such folder.
+def list_images(folder: Path) -> list[Path]:
+    """The images in a folder in natural order, without depth; none where there is no such folder.
 
     Raises:
         InputError: where it may not be read.
     """
-    return sorted(_pictures(folder), key=natural)
+    return sorted(_images(folder), key=natural)
 
 
-def holds_pictures(folder: Path) -> bool:
-    """Whether :func:`pictures` finds any; it raises the same."""
-    return bool(_pictures(folder))
+def has_images(folder: Path) -> bool:
+    """Whether :func:`list_images` finds any; it raises the same."""
+    return bool(_images(folder))
 
 
-def _pictures(folder: Path) -> list[Path]:
+def _images(folder: Path) -> list[Path]:
     try:
         files = list(folder.iterdir()) if folder.is_dir() else []
     except OSError as error:
         raise InputError(f"{folder}: cannot be read ({error.strerror}); make it readable") from None
-    return [p for p in files if p.suffix.lower() in PICTURES and ".depth." not in p.name]
+    return [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and ".depth." not in p.name]
 
 
-def is_picture(path: Path) -> bool:
-    """Whether a file is a still picture, by its name or its first bytes."""
-    if path.suffix.lower() in PICTURES:
+def is_image(path: Path) -> bool:
+    """Whether a file is a still image, by its name or its first bytes."""
+    if path.suffix.lower() in IMAGE_SUFFIXES:
         return True
     try:
         with path.open("rb") as file:
@@ -92,7 +92,7 @@ def decode_image(data: bytes, upright: bool = True, counts: Counts | None = None
     Args:
         data: of the file.
         upright: turn it as its EXIF orientation says; otherwise pixels are those that the file holds.
-        counts: black and white of a 16-bit picture; unless given, only one that uses all its 16 bits is decoded.
+        counts: black and white of a 16-bit image; unless given, only one that uses all its 16 bits is decoded.
     """
     if (brand := _brand(data)) in _HEIF + _AVIF:
         return _decode_heif(data) if brand in _HEIF else "image is AVIF. Export it as JPEG."
@@ -126,7 +126,7 @@ def decode_pixels(data: bytes) -> NDArray[Any] | None:
 
 
 def counts_between(histogram: NDArray[np.int64]) -> Counts:
-    """Black and white of 16-bit pictures: what all but a few pixels lie between, or all 16 bits where that is most.
+    """Black and white of 16-bit images: what all but a few pixels lie between, or all 16 bits where that is most.
 
     Args:
         histogram: how many pixels have each of 65536 counts; not none.
@@ -154,7 +154,7 @@ def _brand(data: bytes) -> bytes:
 
 
 def _decode_heif(data: bytes) -> Image | str:
-    """Decode the picture of a phone's HEIC, which says how to turn it by itself, with or without EXIF."""
+    """Decode the image of a phone's HEIC, which says how to turn it by itself, with or without EXIF."""
     try:
         import pillow_heif  # only here: an extra
     except ImportError:
@@ -182,14 +182,14 @@ def _read(path: str | Path, upright: bool, counts: Counts | None) -> Image:
     try:
         image = decode_image(Path(path).read_bytes(), upright, counts)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a picture") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give an image") from None
     if isinstance(image, str):
         raise InputError(f"{path}: {image}" if image.endswith(".") else f"{path}: {image}; give a whole JPEG or PNG")
     return image
 
 
 def stored_size(path: str | Path) -> tuple[int, int]:
-    """(width, height) of a picture as its file stores it, which is what a camera's intrinsics are of.
+    """(width, height) of an image as its file stores it, which is what a camera's intrinsics are of.
 
     Raises:
         InputError: as :func:`read_image`, but not for what its 16 bits hold.

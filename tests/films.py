@@ -1,4 +1,4 @@
-"""A film of patches of known colours, by either standard's matrix."""
+"""A video of patches of known colours, by either standard's matrix."""
 
 from __future__ import annotations
 

@@ -16,6 +16,7 @@ RENAMED = [
     ("mambaloc.runtime.localisation", "Localisation", "Localization"),
     ("mambaloc.runtime.maps", "MapLocaliser", "MapLocalizer"),
     ("mambaloc.runtime.maps", "MapLocalisation", "MapLocalization"),
+    ("mambaloc.demo", "embedded_film", "embedded_video"),
     ("mambaloc.nn", "Discretisation", "Discretization"),
     ("mambaloc.metrics", "summarise", "summarize"),
     ("mambaloc.metrics", "summarise_errors", "summarize_errors"),

@@ -213,7 +213,7 @@ def test_frames_that_were_trained_on_count_for_nothing(scenes):
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared beside the repository")
 @torch.inference_mode()
 def test_pictures_of_another_place_are_unfamiliar():
-    """A kitchen, and 50 pictures of a fox on a table, to a pretrained backbone whose heads know neither."""
+    """A kitchen, and 50 images of a fox on a table, to a pretrained backbone whose heads know neither."""
     weights, root = SHARED / "weights/mobilenetv2_100.imagenet_tf2ptq.safetensors", SHARED / "data/7scenes_blocks"
     backbone = {"backbone_args": {"pad_type": "same"}, "pixel_mean": (0.5,) * 3, "pixel_std": (0.5,) * 3}
     system = LitStudent(

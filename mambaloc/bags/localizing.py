@@ -1,4 +1,4 @@
-"""Localize a bag's pictures, and write their poses into another bag."""
+"""Localize a bag's images, and write their poses into another bag."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.progress import track
 
-from mambaloc.bags.pictures import BagCamera, Picture, camera_of, picture_topic, pictures_of
+from mambaloc.bags.images import BagCamera, BagImage, camera_of, image_topic, images_of
 from mambaloc.bags.reading import Bag, open_bag
 from mambaloc.bags.transforms import Chain, Gap, Matrix, Transforms, along
 from mambaloc.bags.writing import covariance_of, moved, pose_bag
@@ -23,9 +23,9 @@ from mambaloc.runtime.localizer import Localizer
 from mambaloc.runtime.video import Followed, summarize
 
 Straightener = Callable[[BagCamera, tuple[int, int]], tuple[Matrix, Callable[[Image], Image]]]
-"""Of a camera and a picture's size: intrinsics of pictures as the scene has them, and what makes a picture so."""
+"""Of a camera and an image's size: intrinsics of images as the scene has them, and what makes an image so."""
 
-_REMEDY = "Give pictures of the place, and a model that states radii or has a map of it."
+_REMEDY = "Give images of the place, and a model that states radii or has a map of it."
 
 
 def localize_bag(
@@ -37,31 +37,31 @@ def localize_bag(
     intrinsics: ArrayLike | None = None,
     world: str = "map",
     frame: str | None = None,
-    on_picture: Callable[[Picture, Image, ArrayLike | None, Localization], None] | None = None,
+    on_picture: Callable[[BagImage, Image, ArrayLike | None, Localization], None] | None = None,
 ) -> Followed:
-    """Localize every picture of a bag, and write what a robot's filter takes: poses with covariances, at its times.
+    """Localize every image of a bag, and write what a robot's filter takes: poses with covariances, at its times.
 
-    A pose without radii says nothing to a filter, nor does that of a picture that does not look like the place: these
-    are left out with a warning, as are pictures that are damaged. Ctrl-C ends it; what was found is written then.
+    A pose without radii says nothing to a filter, nor does that of an image that does not look like the place: these
+    are left out with a warning, as are images that are damaged. Ctrl-C ends it; what was found is written then.
 
     Args:
         localizer: of the model.
         source: the bag.
         out: the bag to write, as :func:`~mambaloc.bags.writing.pose_bag` takes it.
         straightener: removes the distortion that the bag's ``CameraInfo`` has.
-        topic: of the pictures; the only one unless given.
-        intrinsics: of every picture, (3, 3) in pixels; those of ``CameraInfo`` unless given.
+        topic: of the images; the only one unless given.
+        intrinsics: of every image, (3, 3) in pixels; those of ``CameraInfo`` unless given.
         world: the name of the scene's frame in messages.
         frame: whose poses to write, through the bag's transforms; the camera's optical frame unless given.
-        on_picture: is given each picture, it without distortion, its intrinsics, and what was found of it.
+        on_picture: is given each image, it without distortion, its intrinsics, and what was found of it.
 
     Raises:
-        InputError: where a bag cannot be read or written, a picture cannot be localized, or none has a pose to write.
+        InputError: where a bag cannot be read or written, an image cannot be localized, or none has a pose to write.
     """
     found: list[Localization] = []
     left_out, written = Counter[str](), 0
     with open_bag(source) as bag, pose_bag(out, world) as write:
-        topic = picture_topic(bag, topic)
+        topic = image_topic(bag, topic)
         body_of = _body_of(bag, frame)
         pictures = _straight(bag, topic, straightener, intrinsics, left_out)
         console = Console(stderr=True)
@@ -82,7 +82,7 @@ def localize_bag(
             pass
         said = "; ".join(f"{count} {why}" for why, count in left_out.items())
         if not written:
-            raise InputError(f"{source}: no picture of {topic} has a pose to write ({said}). {_REMEDY}")
+            raise InputError(f"{source}: no image of {topic} has a pose to write ({said}). {_REMEDY}")
     if said:
         warnings.warn(f"{out}: leaves out {said}.", InputWarning, stacklevel=2)
     return summarize(localizer, found)
@@ -102,13 +102,13 @@ def _stated(pose: Localization, cam_from_body: Matrix | Gap) -> tuple[Matrix, Ma
     return moved(np.asarray(pose.position_m), np.asarray(pose.quaternion), covariance, cam_from_body)
 
 
-def _body_of(bag: Bag, frame: str | None) -> Callable[[Picture], Matrix | Gap]:
-    """What gives ``cam_from_body`` (4, 4) at a picture's time."""
+def _body_of(bag: Bag, frame: str | None) -> Callable[[BagImage], Matrix | Gap]:
+    """What gives ``cam_from_body`` (4, 4) at an image's time."""
     if frame is None:
         return lambda picture: np.eye(4)
     transforms, paths = Transforms(bag), dict[str, Chain]()
 
-    def at(picture: Picture) -> Matrix | Gap:
+    def at(picture: BagImage) -> Matrix | Gap:
         if picture.frame not in paths:
             paths[picture.frame] = transforms.path(picture.frame, frame)
         return along(paths[picture.frame], picture.ns)
@@ -118,11 +118,11 @@ def _body_of(bag: Bag, frame: str | None) -> Callable[[Picture], Matrix | Gap]:
 
 def _straight(
     bag: Bag, topic: str, straightener: Straightener, intrinsics: ArrayLike | None, left_out: Counter[str]
-) -> Iterator[tuple[Picture, Image, ArrayLike | None]]:
-    """A topic's whole pictures as the scene has them, with their intrinsics; None where nothing says them."""
+) -> Iterator[tuple[BagImage, Image, ArrayLike | None]]:
+    """A topic's whole images as the scene has them, with their intrinsics; None where nothing says them."""
     told = None if intrinsics is not None else camera_of(bag, topic)
     made: dict[tuple[int, int], tuple[Matrix, Callable[[Image], Image]]] = {}
-    for picture in pictures_of(bag, topic):
+    for picture in images_of(bag, topic):
         if isinstance(picture.image, str):
             left_out["that are damaged"] += 1
             continue

@@ -66,7 +66,7 @@ def pose_source(bag: Bag, camera: str, asked: str | None = None, of: str | None 
     if not topics:
         raise InputError(
             f"{bag.path}: nothing says where the camera {camera!r} was: it has no Odometry, PoseStamped or "
-            f"TransformStamped, and {_still(transforms, camera)}. Record one of them with the pictures."
+            f"TransformStamped, and {_still(transforms, camera)}. Record one of them with the images."
         )
     if asked is None and len(topics) > 1:
         raise InputError(f"{bag.path}: has poses in {', '.join(topics)}. Choose one with --pose-topic NAME.")
@@ -119,7 +119,7 @@ def _parts(message: Any) -> tuple[Any, Any]:
 
 
 class Gaps:
-    """Pictures that have no pose, counted by why."""
+    """Images that have no pose, counted by why."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -143,4 +143,4 @@ class Gaps:
             gap = self.longest.get(why)
             longest = f", the longest of {gap.length_s:.2f} s around {gap.ns / 1e9:.2f} s" if gap else ""
             said.append(f"{count} {why}{longest}")
-        return f"{sum(self.counts.values())} pictures have no pose: {'; '.join(said)}" if said else ""
+        return f"{sum(self.counts.values())} images have no pose: {'; '.join(said)}" if said else ""

@@ -1,6 +1,6 @@
 """A ROS bag's messages, one after another: ROS 1 ``.bag``, and ROS 2 in SQLite (``.db3``) and MCAP, by rosbags.
 
-Times are those of the messages' headers, in nanoseconds: when a picture was taken, not when it was recorded.
+Times are those of the messages' headers, in nanoseconds: when an image was taken, not when it was recorded.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ _MODULES = {
     "import": ("import_scene", "make a scene of a capture"),
     "export-scene": ("export_scene", "write an imported scene as kapture"),
     "map": ("map", "build a sparse map, or change one"),
-    "localize": ("localize", "localize pictures, a film or a camera"),
+    "localize": ("localize", "localize images, a video or a camera"),
     "export": ("export", "write a bundle for apps"),
     "verify": ("verify_bundle", "replay a bundle's frames through its models"),
     "demo": ("demo", "localize in a browser"),

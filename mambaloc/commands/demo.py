@@ -1,9 +1,9 @@
-"""Localize in a browser: mambaloc demo [BUNDLE] [--port 8000] [--lan] [--film VIDEO] [--out FOLDER]."""
+"""Localize in a browser: mambaloc demo [BUNDLE] [--port 8000] [--lan] [--video FILE] [--out FOLDER]."""
 
 from pathlib import Path
 
 from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
-from mambaloc.demo import build_site, embedded_film, serve_page
+from mambaloc.demo import build_site, embedded_video, serve_page
 
 
 @exits_cleanly
@@ -14,15 +14,17 @@ def main() -> None:
     parser.add_argument("bundle", nargs="?", type=Path, help="of mambaloc export; the embedded room's by default")
     parser.add_argument("--port", type=whole_number(0, 65535), default=8000, help="0 takes a free one")
     parser.add_argument("--lan", action="store_true", help="serve the local network by HTTPS, for a phone's camera")
-    parser.add_argument("--film", type=Path, help="video for the page to play")
+    parser.add_argument(
+        "--video", "--film", type=Path, metavar="FILE", help="for the page to play; --film is its old name"
+    )
     parser.add_argument("--out", type=Path, help="write the page there, for any web server, and end")
     args = parser.parse_args()
     bundle = args.bundle or _released_bundle()
-    film = args.film or (None if args.bundle else embedded_film())
+    video = args.video or (None if args.bundle else embedded_video())
     if args.out:
-        print(f"wrote {build_site(bundle, args.out, film)}")
+        print(f"wrote {build_site(bundle, args.out, video)}")
     else:
-        serve_page(bundle, film, args.port, args.lan)
+        serve_page(bundle, video, args.port, args.lan)
 
 
 def _released_bundle() -> Path:

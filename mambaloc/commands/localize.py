@@ -1,4 +1,4 @@
-"""Localize pictures: mambaloc localize [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA_OR_BAG [--filter causal|smooth]."""
+"""Localize images: mambaloc localize [MODEL|MAP] VIDEO_OR_FOLDER_OR_CAMERA_OR_BAG [--filter causal|smooth]."""
 
 from argparse import Namespace
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mambaloc.bags.pictures import Picture
+from mambaloc.bags.images import BagImage
 from mambaloc.bags.reading import is_bag
 from mambaloc.bags.writing import TOPIC
 from mambaloc.console import OptionParser, black_and_white, exits_cleanly, pinhole_matrix, thread_count
@@ -32,7 +32,7 @@ def main() -> None:
         help="bundle, exported model, map.safetensors or ARCH.TAG; unless given, the embedded room's",
     )
     parser.add_argument(
-        "source", help="a video, a picture, a folder of pictures (30 a second), a camera's number, or a ROS bag"
+        "source", help="a video, an image, a folder of images (30 a second), a camera's number, or a ROS bag"
     )
     parser.add_argument(
         "--out",
@@ -57,14 +57,14 @@ def main() -> None:
         "--counts",
         type=black_and_white,
         metavar="BLACK,WHITE",
-        help="of 16-bit pictures, as the scene's report.md says; those that use all 16 bits need none",
+        help="of 16-bit images, as the scene's report.md says; those that use all 16 bits need none",
     )
     maps = parser.add_mutually_exclusive_group()
     maps.add_argument(
         "--map", dest="sparse_map", default=True, metavar="FILE", help="beside the model; a bundle's own unless given"
     )
     maps.add_argument("--no-map", dest="sparse_map", action="store_false", help="let the network answer alone")
-    parser.add_argument("--topic", metavar="NAME", help="of a bag's pictures, where it has several")
+    parser.add_argument("--topic", metavar="NAME", help="of a bag's images, where it has several")
     parser.add_argument("--world-frame", metavar="FRAME", help="that a bag's poses are in; map unless given")
     parser.add_argument("--pose-frame", metavar="FRAME", help="that a bag's poses are of; the camera's unless given")
     parser.add_argument(
@@ -129,7 +129,7 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
     if args.out.suffix == ".tum":
         raise InputError(f"--out {args.out}: a bag's poses go into a bag. Give --out FILE.bag, or a folder for ROS 2.")
 
-    def record(picture: Picture, image: Image, matrix: ArrayLike | None, pose: Localization) -> None:
+    def record(picture: BagImage, image: Image, matrix: ArrayLike | None, pose: Localization) -> None:
         assert recording is not None
         own = localizer.intrinsics_of((image.shape[1], image.shape[0])) if matrix is None else matrix
         recording.add_frame(image, pose, np.datetime64(picture.ns, "ns"), own)

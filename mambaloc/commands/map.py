@@ -110,24 +110,24 @@ def _parser() -> OptionParser:
     parser.add_argument(
         "--width",
         type=whole_number(LEAST["width"]),
-        help="of the pictures in which keypoints are searched, in pixels; narrower ones are searched as they are",
+        help="of the images in which keypoints are searched, in pixels; narrower ones are searched as they are",
     )
     parser.add_argument("--points", choices=POINTS, help="our own unless given, or those of an imported COLMAP model")
     parser.add_argument("--out", type=Path, help="folder to write to; a new map's is runs/NAME unless given")
     change = parser.add_mutually_exclusive_group()
     change.add_argument(
-        "--add", type=Path, metavar="FRAMES", help="a scene or recipe with poses, a folder of pictures, or a film"
+        "--add", type=Path, metavar="FRAMES", help="a scene or recipe with poses, a folder of images, or a video"
     )
     change.add_argument("--remove", metavar="NAME", help="what was added under this name")
     parser.add_argument("--name", help="of what is added, by which it may be removed; that of FRAMES unless given")
     cameras = parser.add_mutually_exclusive_group()
     cameras.add_argument(
-        "--intrinsics", type=pinhole_matrix, metavar="FX,FY,CX,CY", help="of pictures to add; the map's unless given"
+        "--intrinsics", type=pinhole_matrix, metavar="FX,FY,CX,CY", help="of images to add; the map's unless given"
     )
     cameras.add_argument(
         "--distorted",
         action="store_true",
-        help="pictures to add are as the map's camera stores them, and are undistorted by its lens",
+        help="images to add are as the map's camera stores them, and are undistorted by its lens",
     )
     parser.add_argument("--test", type=Path, metavar="RECIPE|SCENE", help="measure the map on its test frames")
     return parser

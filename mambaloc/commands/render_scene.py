@@ -21,7 +21,7 @@ def main() -> None:
     parser.add_argument("--poses", type=Path, help="CSV scene,split,image,x,y,z,qw,qx,qy,qz; else the embedded room")
     parser.add_argument("--scene", help="which scene of the CSV")
     parser.add_argument("--layout", choices=["7scenes", "cambridge"], help="7scenes unless given")
-    parser.add_argument("--size", help="WIDTHxHEIGHT of the pictures; 320x240 unless given")
+    parser.add_argument("--size", help="WIDTHxHEIGHT of the images; 320x240 unless given")
     parser.add_argument("--limit", type=whole_number(1), help="at most so many frames of each split, evenly spaced")
     parser.add_argument("--seed", type=whole_number(0), help="another seed is another room")
     args = parser.parse_args()

@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument(
         "--distorted",
         action="store_true",
-        help="pictures are as the training camera stores them, unless a request says distorted=false",
+        help="images are as the training camera stores them, unless a request says distorted=false",
     )
     args = parser.parse_args()
     try:

@@ -94,7 +94,7 @@ class RandomCrop:
 class RandomRotation:
     """What a camera turned about its centre, and perhaps zoomed, sees of the frame: exact, black beyond its border.
 
-    The true pose is the turned camera's, and intrinsics are its own, so that nothing is asked for that the picture does
+    The true pose is the turned camera's, and intrinsics are its own, so that nothing is asked for that the image does
     not show. Frames of a clip turn each on its own: poses of a clip relative to each other stay true.
 
     Args:

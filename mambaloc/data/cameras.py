@@ -23,7 +23,7 @@ Size = tuple[int, int]
 
 ASSUMED_FOCAL = 0.87
 """Focal length over the longer side where a scene does not give it: that of Cambridge Landmarks' phone, whose models
-have 1670 px at 1920x1080. Films of most phones lie within a tenth of it."""
+have 1670 px at 1920x1080. Videos of most phones lie within a tenth of it."""
 
 _SEVEN_SCENES_FOCAL = 525 / 640  # of the colour camera, over the width; 585 is the depth camera's
 
@@ -36,13 +36,13 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
     """The cameras of frames as the scene gives them.
 
     An imported or rendered scene has them in ``scene.json``. 7-Scenes has one camera, of 525 px at a width of 640; its
-    principal point is the picture's centre. Other scenes have those of ``reconstruction.nvm`` or a COLMAP model, by
+    principal point is the image's centre. Other scenes have those of ``reconstruction.nvm`` or a COLMAP model, by
     image and without distortion; an image that the model lacks gets its camera of median focal length.
 
     Args:
         dataset: its name.
         folder: of the scene.
-        frames: of it, the first with a readable picture; unless the cameras are by name, all pictures have its size.
+        frames: of it, the first with a readable image; unless the cameras are by name, all images have its size.
 
     Raises:
         UnknownCameraError: where the scene does not give them.
@@ -69,7 +69,7 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
 
 
 def frame_intrinsics(dataset: str, folder: Path, frames: Frames) -> Floats:
-    """Pinhole matrices of frames, (N, 3, 3), in pixels of each picture; arguments and errors of :func:`known_cameras`.
+    """Pinhole matrices of frames, (N, 3, 3), in pixels of each image; arguments and errors of :func:`known_cameras`.
 
     What needs the true cameras, such as a map, asks here.
     """
@@ -85,19 +85,19 @@ def known_or_assumed_cameras(dataset: str, folder: Path, frames: Frames) -> Came
     try:
         return known_cameras(dataset, folder, frames)
     except UnknownCameraError as error:
-        assumed = f"A focal length of {ASSUMED_FOCAL:g} of the pictures' longer side is assumed."
+        assumed = f"A focal length of {ASSUMED_FOCAL:g} of the images' longer side is assumed."
         warnings.warn(f"{error} {assumed}", InputWarning, stacklevel=2)
     height, width = read_image(frames.image_paths[0]).shape[:2]
     return replace(_alike(assumed_intrinsics((width, height)), (width, height), frames), is_assumed=True)
 
 
 def assumed_intrinsics(size: Size) -> Floats:
-    """The usual camera's pinhole matrix, (3, 3), for pictures of a size (width, height)."""
+    """The usual camera's pinhole matrix, (3, 3), for images of a size (width, height)."""
     return _centered(ASSUMED_FOCAL * max(size), size)
 
 
 def undistortion_of(folder: Path) -> Undistortion:
-    """How a scene's training pictures were made of what their camera stored, where all are of one.
+    """How a scene's training images were made of what their camera stored, where all are of one.
 
     Raises:
         InputError: where ``scene.json`` says of it what cannot be read.
@@ -178,7 +178,7 @@ def _of_capture(folder: Path, frames: Frames) -> Cameras:
 
 
 def _captured(path: Path, told: Any, name: str) -> tuple[Floats, Size]:
-    """Matrix of a camera of ``scene.json``, and size of its pictures."""
+    """Matrix of a camera of ``scene.json``, and size of its images."""
     camera = told.get(name) if isinstance(told, dict) else None
     if camera is None or (isinstance(camera, dict) and not {"focal_px", "centre_px"} <= set(camera)):
         raise UnknownCameraError(

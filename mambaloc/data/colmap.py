@@ -103,7 +103,7 @@ def is_sound(camera: Any) -> bool:
 
 
 def pinhole_of(camera: Any, size_px: tuple[int, int]) -> NDArray[np.float64]:
-    """Intrinsics (3, 3) of a sound ``pycolmap.Camera`` in pixels of pictures of a size (width, height).
+    """Intrinsics (3, 3) of a sound ``pycolmap.Camera`` in pixels of images of a size (width, height).
 
     Of a distorted camera model the pinhole part is taken. COLMAP counts from the corner of the top-left pixel.
     """

@@ -1,8 +1,8 @@
 """COLMAP's text models as they are found in the wild, in the form that pycolmap reads.
 
-A picture has two lines: ``IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME``, and its points ``X Y POINT3D_ID ...``, which
+An image has two lines: ``IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME``, and its points ``X Y POINT3D_ID ...``, which
 may be empty. pycolmap cuts a name at its first space, takes the second line for granted, so that it skips every other
-picture of a file without it, and asks for ``points3D``. Source: colmap.github.io/format.html.
+image of a file without it, and asks for ``points3D``. Source: colmap.github.io/format.html.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TextIO
 from mambaloc.errors import InputError
 from mambaloc.text import open_text
 
-_PICTURE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+_IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _BEFORE_NAME = 9  # words
 _LONGEST_LINE = 1 << 26  # characters: a million points
 _TEXTS = ("cameras.txt", "points3D.txt", "rigs.txt", "frames.txt")
@@ -32,7 +32,7 @@ def readable(path: Path) -> Iterator[tuple[Path, dict[int, str]]]:
         path: the folder of a model, text or binary.
 
     Raises:
-        InputError: for a file that is missing, no text, or a line that is neither a picture nor its points.
+        InputError: for a file that is missing, no text, or a line that is neither an image nor its points.
     """
     is_binary = (path / "images.bin").is_file()
     cameras, points = (path / f"{name}{'.bin' if is_binary else '.txt'}" for name in ("cameras", "points3D"))
@@ -61,33 +61,33 @@ def count_images(path: Path) -> int:
         if (path / "images.bin").is_file():
             with (path / "images.bin").open("rb") as file:
                 return int.from_bytes(file.read(8), "little")
-        return sum(1 for _ in _pictures(path / "images.txt"))
+        return sum(1 for _ in _images(path / "images.txt"))
     except (InputError, OSError):
         return 0
 
 
 def _numbered(source: Path, target: Path) -> dict[int, str]:
-    """Write the pictures with their numbers for names, two lines each, and return the names by number."""
+    """Write the images with their numbers for names, two lines each, and return the names by number."""
     names: dict[int, str] = {}
     with target.open("w", encoding="utf-8") as file:
-        for number, words, points in _pictures(source):
+        for number, words, points in _images(source):
             image = int(words[0])
             if image in names:
-                raise InputError(f"{source}, line {number}: gives the number {image} to a second picture; change one")
+                raise InputError(f"{source}, line {number}: gives the number {image} to a second image; change one")
             names[image] = words[_BEFORE_NAME]
             file.write(f"{' '.join(words[:_BEFORE_NAME])} {image}\n{points}\n")
     return names
 
 
-def _pictures(path: Path) -> Iterator[tuple[int, list[str], str]]:
-    """The number of each picture's line, its ten words, and its line of points, empty where it has none."""
+def _images(path: Path) -> Iterator[tuple[int, list[str], str]]:
+    """The number of each image's line, its ten words, and its line of points, empty where it has none."""
     lines = _lines(path)
     number, line = next(lines, (0, ""))
     while number:
-        if line and not _is_picture(line):
+        if line and not _is_image(line):
             raise InputError(
-                f"{path}, line {number}: is no picture '{_PICTURE}', and no points 'X Y POINT3D_ID ...' of the picture "
-                "before it. Write two lines a picture, the second empty where it has no points."
+                f"{path}, line {number}: is no image '{_IMAGE_LINE}', and no points 'X Y POINT3D_ID ...' of the image "
+                "before it. Write two lines an image, the second empty where it has no points."
             )
         following = next(lines, (0, ""))
         if line:
@@ -97,14 +97,14 @@ def _pictures(path: Path) -> Iterator[tuple[int, list[str], str]]:
         number, line = following
 
 
-def _is_picture(line: str) -> bool:
+def _is_image(line: str) -> bool:
     words = line.split(maxsplit=_BEFORE_NAME)
     is_like = len(words) > _BEFORE_NAME and _is_whole(words[0]) and _is_whole(words[_BEFORE_NAME - 1])
     return is_like and not _is_points(line.split())
 
 
 def _is_points(words: list[str]) -> bool:
-    """Whether a line is one of points, rather than of a picture whose name ends in a number."""
+    """Whether a line is one of points, rather than of an image whose name ends in a number."""
     return len(words) % 3 == 0 and all(map(_is_whole, words[2::3])) and all(map(_is_number, words[: 2 * _BEFORE_NAME]))
 
 
@@ -127,7 +127,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         while line := file.readline(_LONGEST_LINE):
             number += 1
             if len(line) == _LONGEST_LINE:
-                raise InputError(f"{path}, line {number}: is longer than any picture's; export the model again")
+                raise InputError(f"{path}, line {number}: is longer than any image's; export the model again")
             if not line.startswith("#"):
                 yield number, line.strip()
 

@@ -140,7 +140,7 @@ class PoseDataModule(L.LightningDataModule):
 
     @property
     def undistortion(self) -> Undistortion:
-        """How the scene's pictures were made of what their camera stored."""
+        """How the scene's images were made of what their camera stored."""
         return undistortion_of(self.folder)
 
     def each_scene(self) -> list[PoseDataModule]:

@@ -60,11 +60,11 @@ class CachedFrames(Dataset[PoseBatch]):
 
     @property
     def nbytes(self) -> int:
-        """Of all pictures."""
+        """Of all images."""
         return self.images.nbytes
 
     def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Decoded pictures of some rows, (B, 3, H, W)."""
+        """Decoded images of some rows, (B, 3, H, W)."""
         pictures = np.stack([self.images[row] for row in rows])
         release_pages(self.images)
         return pictures
@@ -124,7 +124,7 @@ def load_split(
 
     Raises:
         InputError: as :func:`~mambaloc.data.cache.cached_frames`, for images that do not hold the crop, and for cameras
-            of pictures of another shape.
+            of images of another shape.
     """
     folder = Path(cache_dir) if cache_dir else None
     cache = cached_frames(frames.image_paths, short_side, bad, folder, crop if is_mixed else None)
@@ -144,7 +144,7 @@ def load_split(
         if resized_size((high, wide), short_side) != tuple(cache.sizes[row].tolist()):
             raise InputError(
                 f"{frames.image_paths[row]}: has another shape than its camera's {wide}x{high} pixels. "
-                "Give the intrinsics of this picture."
+                "Give the intrinsics of this image."
             )
     if (cache.sizes != (height, width)).any():
         cameras = _of_middle(cameras, cache.sizes, (height, width))
@@ -153,7 +153,7 @@ def load_split(
 
 
 def _of_middle(cameras: Cameras, sizes: NDArray[np.int64], crop: tuple[int, int]) -> Cameras:
-    """Cameras of the middle (height, width) of pictures that were resized to sizes (N, 2), likewise."""
+    """Cameras of the middle (height, width) of images that were resized to sizes (N, 2), likewise."""
     size_px, resized = torch.from_numpy(cameras.size_px), torch.from_numpy(sizes).flip(1)
     scale_x, scale_y = (resized / size_px).unbind(dim=1)
     intrinsics = resized_intrinsics(torch.from_numpy(cameras.intrinsics), scale_x, scale_y)

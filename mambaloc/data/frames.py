@@ -129,7 +129,7 @@ class Cameras:
     """The pinhole camera of each of N frames.
 
     Shape:
-        ``intrinsics`` (N, 3, 3) float64, in pixels of pictures of ``size_px`` (N, 2): width and height.
+        ``intrinsics`` (N, 3, 3) float64, in pixels of images of ``size_px`` (N, 2): width and height.
 
     Args:
         is_assumed: the scene does not give its cameras, and a usual one is assumed.

@@ -90,7 +90,7 @@ class Scene:
             raise InputError(f"data.points_per_frame {self.points_per_frame}: must be 0 or more; 0 reads none")
         if self.views and self.clip_length > 1:
             raise InputError(
-                f"data.clip_length {self.clip_length}: data.views are single pictures, of no sequence. Set one of the "
+                f"data.clip_length {self.clip_length}: data.views are single images, of no sequence. Set one of the "
                 "two off."
             )
 
@@ -246,7 +246,7 @@ class Scene:
 
     def _decode(self, frames: Frames, bad: BadFrames) -> LoadedSplit:
         cameras_of = partial(known_or_assumed_cameras, self.dataset, self.folder)
-        is_mixed = self.dataset == CAPTURE  # whose cameras were fitted to each picture
+        is_mixed = self.dataset == CAPTURE  # whose cameras were fitted to each image
         return load_split(frames, bad, cameras_of, self.short_side, self.crop, self.cache_dir, is_mixed)
 
     def _with_points(self, loaded: LoadedSplit, splatter: Splatter | None = None) -> LoadedSplit:

@@ -1,7 +1,9 @@
 """A bundle in a browser: the page as a static site, and a server for this machine or the local network."""
 
-from mambaloc.demo.film import embedded_film
 from mambaloc.demo.server import serve, serve_page
 from mambaloc.demo.site import build_site
+from mambaloc.renamed import renamed
+from mambaloc.demo.video import embedded_video
 
-__all__ = ["build_site", "embedded_film", "serve", "serve_page"]
+__getattr__ = renamed(__name__, {"embedded_film": "embedded_video"})
+__all__ = ["build_site", "embedded_video", "serve", "serve_page"]

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 from rich.console import Console
 
-from mambaloc.demo.film import FILM_FILE, POSES_FILE
+from mambaloc.demo.video import POSES_FILE, VIDEO_FILE
 from mambaloc.errors import InputError
 from mambaloc.files import whole_folder
 from mambaloc.runtime.bundle import CONTRACT_FILE, verify_bundle
@@ -30,10 +30,10 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
     Args:
         bundle: which :func:`~mambaloc.runtime.bundle.verify_bundle` finds as it was written.
         out: the folder, which must not be there yet.
-        film: a video for the page to play, or what :func:`embedded_film` gives.
+        film: a video for the page to play, or what :func:`embedded_video` gives.
 
     Raises:
-        InputError: for a bundle or film that is none, a folder that cannot be written, or without Node.js's npm.
+        InputError: for a bundle or video that is none, a folder that cannot be written, or without Node.js's npm.
     """
     verify_bundle(bundle)
     if out.exists():
@@ -48,7 +48,7 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
         for name in _listed(bundle):
             (site / "bundle" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(bundle / name, site / "bundle" / name)
-        _add_film(site, film)
+        _add_video(site, film)
     return out
 
 
@@ -85,15 +85,15 @@ def _listed(bundle: Path) -> list[str]:
     return [CONTRACT_FILE, *contract["files"]]
 
 
-def _add_film(site: Path, film: Path | None) -> None:
+def _add_video(site: Path, film: Path | None) -> None:
     if film is None:
         (site / POSES_FILE).write_text("null\n", encoding="utf-8")  # there is none
     elif (film / POSES_FILE).is_file():
-        for name in (FILM_FILE, POSES_FILE):
+        for name in (VIDEO_FILE, POSES_FILE):
             shutil.copyfile(film / name, site / name)
     elif film.is_file() and cv2.VideoCapture(str(film)).read()[0]:
         file = f"film{film.suffix.lower()}"
         shutil.copyfile(film, site / file)
         (site / POSES_FILE).write_text(json.dumps({"file": file}) + "\n", encoding="utf-8")
     else:
-        raise InputError(f"{film}: no film; give a video that browsers play, as MP4 or WebM")
+        raise InputError(f"{film}: no video; give a video that browsers play, as MP4 or WebM")

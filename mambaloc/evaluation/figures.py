@@ -1,4 +1,4 @@
-"""The paper's figures: which systems are run on which frames, and where the pictures go."""
+"""The paper's figures: which systems are run on which frames, and where the images go."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def draw_figures(kind: str, trained: Sequence[Trained], out: Path, frames: int =
 
     Args:
         kind: a key of :data:`FIGURES`.
-        trained: the systems; all kinds but ``trajectory`` show them in one picture, on the same frames.
+        trained: the systems; all kinds but ``trajectory`` show them in one image, on the same frames.
         out: the folder to write to.
         frames: how many test frames, evenly spaced, ``heatmaps`` and ``features`` show.
 
@@ -52,7 +52,7 @@ def draw_figures(kind: str, trained: Sequence[Trained], out: Path, frames: int =
 
 
 def _trajectory(trained: Sequence[Trained], out: Path, frames: int) -> list[Path]:
-    """A picture and a page a system, of every test frame."""
+    """An image and a page a system, of every test frame."""
     written = []
     for number, each in enumerate(trained, start=1):
         table, told = localize_test_frames(each.system, each.data), each.data.frames("test")

@@ -1,4 +1,4 @@
-"""Test frames as a recording for the Rerun viewer: what the trajectory's figure shows, with the pictures."""
+"""Test frames as a recording for the Rerun viewer: what the trajectory's figure shows, with the images."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def record_test_frames(
         both: answers of both together, which are recorded in place of the network's.
 
     Raises:
-        InputError: as :func:`~mambaloc.viz.rerun_recording.rerun_recording`, or for a bad picture.
+        InputError: as :func:`~mambaloc.viz.rerun_recording.rerun_recording`, or for a bad image.
     """
     frames, scene = trained.data.frames("test"), trained.data.hparams["scene"]
     poses: Sequence[Localization] = _network(trained, table) if both is None else both.poses

@@ -87,7 +87,7 @@ def _map_line(in_map: dict[str, Any]) -> str:
     metrics = in_map["metrics"]
     return (
         f"map: {metrics['accepted']:.1%} of its poses accepted, {metrics['accepted_and_wrong']:.1%} of them wrong "
-        f"(over 0.2 m or 5°); {metrics['query_cpu_ms']:.0f} ms of CPU time a picture, {in_map['mib']:.2f} MiB"
+        f"(over 0.2 m or 5°); {metrics['query_cpu_ms']:.0f} ms of CPU time an image, {in_map['mib']:.2f} MiB"
     )
 
 

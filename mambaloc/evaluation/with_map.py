@@ -39,7 +39,7 @@ class Answers:
         sources: what gave each, ``map`` or ``network``.
         is_accepted: which of them are poses that the map accepts, (N,).
         is_covered: which true poses are inside the 90 % ellipsoid of the answer's covariance, (N,).
-        cpu_s: CPU time that the map took on all cores, without decoding the picture, (N,).
+        cpu_s: CPU time that the map took on all cores, without decoding the image, (N,).
         poses: the answers of a network and a map together, with their radii; none of a map alone.
     """
 

@@ -58,7 +58,7 @@ def check_scene(path: Path, sparse_map: SparseMap, data: PoseDataModule) -> None
 
 
 def scene_intrinsics(data: PoseDataModule, frames: Frames) -> np.ndarray:
-    """Pinhole matrices (N, 3, 3) of frames of a data module's scene, in pixels of each picture."""
+    """Pinhole matrices (N, 3, 3) of frames of a data module's scene, in pixels of each image."""
     return frame_intrinsics(data.hparams["dataset"], data.folder, frames)
 
 

@@ -142,7 +142,7 @@ def contract_of(
         data: hyperparameters of the data module that it was trained with.
         uncertainty: that the model will tell.
         world: of the scene; without a shift unless given.
-        undistortion: of the scene's pictures; with no lens known unless given.
+        undistortion: of the scene's images; with no lens known unless given.
         scenes: that the network knows, where there are several.
     """
     preprocessing = Preprocessing(data["short_side"], system.image_size)

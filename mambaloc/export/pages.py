@@ -37,7 +37,7 @@ def write_pages(
     for name, text in (
         ("README.md", _card(contract, models, sparse_map, is_native)),
         ("LICENSE.txt", _licence(dataset)),
-        ("INTEGRATION.md", f"{page}\n{_pictures(contract.undistortion)}"),
+        ("INTEGRATION.md", f"{page}\n{_images(contract.undistortion)}"),
     ):
         (folder / name).write_text(text, encoding="utf-8")
     if sparse_map is not None and is_native:
@@ -103,29 +103,29 @@ def _lens(contract: Contract) -> str:
         return ""
     return """## Another lens
 
-Pictures of any camera and shape are localized if their intrinsics are known. The models take them as a required input,
+Images of any camera and shape are localized if their intrinsics are known. The models take them as a required input,
 which `INTEGRATION.md` fills in with the training camera's, `intrinsics` in `contract.json`, where they are not.
 
 """
 
 
-def _pictures(undistortion: Undistortion) -> str:
-    """What pictures must be, and by which lens the camera's own become so."""
-    must = "Pictures must be without lens distortion, as the training pictures are taken to be."
+def _images(undistortion: Undistortion) -> str:
+    """What images must be, and by which lens the camera's own become so."""
+    must = "Images must be without lens distortion, as the training images are taken to be."
     lens, left = undistortion.lens, undistortion.leaves
     if lens is None or left is None:
-        return f"""## Pictures
+        return f"""## Images
 
 {must} The lens of their camera is not known here:
 {undistortion.unknown}.
 """
     (width, height), (fx, fy), (cx, cy) = undistortion.stored, left.focal_px, left.center_px
-    return f"""## Pictures
+    return f"""## Images
 
 {must} Their camera stored these
 as {width}x{height}, through a lens of OpenCV's {lens.name} model: `lens` of `undistortion` in `contract.json`.
 Undistorting leaves {left.width}x{left.height} with the pinhole matrix
-{fx:.2f} 0 {cx:.2f}, 0 {fy:.2f} {cy:.2f}, 0 0 1, which is `leaves` there. Pictures of the same camera need the same,
+{fx:.2f} 0 {cx:.2f}, 0 {fy:.2f} {cy:.2f}, 0 0 1, which is `leaves` there. Images of the same camera need the same,
 resized ones with both scaled: in Python, `Localizer.localize(picture, is_distorted=True)` and
 `mambaloc localize --distorted`; in an app, OpenCV's `initUndistortRectifyMap` (for a fisheye,
 `fisheye::initUndistortRectifyMap`) and `remap`, as `function` there says.
@@ -141,7 +141,7 @@ def _uncertainty(contract: Contract) -> str:
     return (
         f"Beside the pose the models say `position_radius_m` and `rotation_radius_deg`: {told['level']:.0%} of the "
         f"{told['held_out_frames']} frames that were held out of training are within these of their true poses. "
-        "`unfamiliarity` over 1 means that the picture hardly looks like the place: do not use its pose."
+        "`unfamiliarity` over 1 means that the image hardly looks like the place: do not use its pose."
     )
 
 

@@ -1,4 +1,4 @@
-"""Resizing, cropping and scaling inside of the model, so that an app feeds it a picture as it is."""
+"""Resizing, cropping and scaling inside of the model, so that an app feeds it an image as it is."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ def with_preprocessing(
     """Put :class:`Preprocessing` before a network, as operators that every build of ONNX Runtime has.
 
     Averaging areas is a product with the overlaps of old and new pixels, once for rows and once for columns. Rows come
-    first and of all channels at once: only what is left is transposed. Where a picture is exactly halved, OpenCV rounds
+    first and of all channels at once: only what is left is transposed. Where an image is exactly halved, OpenCV rounds
     halves up, not to even: an eighth added to quarters does.
 
     Args:
         model: the network.
         preprocessing: of its input.
-        focal_px: of the training camera in the network's input, for a network that takes intrinsics. Then pictures are
+        focal_px: of the training camera in the network's input, for a network that takes intrinsics. Then images are
             resized as :meth:`~mambaloc.runtime.contract.Contract.preprocessing_for` says.
 
     Shape:

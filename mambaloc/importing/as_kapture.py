@@ -34,7 +34,7 @@ Sensors = dict[tuple[str, ...], str]
 def write_kapture(scene: Path, out: Path) -> tuple[dict[str, int], int]:
     """Write an imported scene as kaptures in a folder, which appears once it is whole.
 
-    Pictures are linked to the scene's where the file system can, and copied else. Time stamps are microseconds where
+    Images are linked to the scene's where the file system can, and copied else. Time stamps are microseconds where
     every frame has a time and no camera two frames at one; they count frames else.
 
     Args:
@@ -45,7 +45,7 @@ def write_kapture(scene: Path, out: Path) -> tuple[dict[str, int], int]:
         How many frames each kapture has, by its folder's name, and how many the scene marks as unused.
 
     Raises:
-        InputError: for a scene that is none or marks no frame, a picture whose path has a comma, or a folder that is
+        InputError: for a scene that is none or marks no frame, an image whose path has a comma, or a folder that is
             there or cannot be written.
     """
     if out.exists():
@@ -122,7 +122,7 @@ def _write(file: Path, columns: str, rows: Iterable[str]) -> None:
 
 
 def _place(image: Path, target: Path) -> None:
-    """Give a picture a second name, or a copy where the file system has no links or the folder lies on another."""
+    """Give an image a second name, or a copy where the file system has no links or the folder lies on another."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(image.resolve(), target)

@@ -23,7 +23,7 @@ from mambaloc.runtime.camera_models import CameraModel, model_to_json, numbers_t
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
 ADJUSTED_FILE = "frames_adjusted.csv"
-"""Beside ``frames.csv``, in its form: poses that were adjusted to the pictures, and the names of cameras that were,
+"""Beside ``frames.csv``, in its form: poses that were adjusted to the images, and the names of cameras that were,
 which ``scene.json`` has beside those given. Nothing reads it by itself."""
 
 POSE = (
@@ -46,8 +46,8 @@ class Imported:
         proposals: ways to split; empty where nothing can be split.
         chosen: the one that was taken.
         left_out: the rule that each frame that was left out breaks, by file.
-        agreement: how pictures agree with poses and camera, where they were compared.
-        adjusted: poses adjusted to the pictures, (N, 4, 4), where they were asked for.
+        agreement: how images agree with poses and camera, where they were compared.
+        adjusted: poses adjusted to the images, (N, 4, 4), where they were asked for.
     """
 
     capture: Capture

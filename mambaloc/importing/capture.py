@@ -26,7 +26,7 @@ class Camera(Pinhole):
 
     Args:
         distorted: pixels (N, 2) of rays (N, 2), which are ``x / z`` and ``y / z``; None for a pinhole. Only a
-            :class:`~mambaloc.runtime.camera_models.CameraModel` can be kept, for pictures to localize.
+            :class:`~mambaloc.runtime.camera_models.CameraModel` can be kept, for images to localize.
         model: what the format calls it.
     """
 

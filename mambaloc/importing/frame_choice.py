@@ -1,4 +1,4 @@
-"""Which frames of a film are worth posing: the sharpest of each stretch in which the view has moved enough.
+"""Which frames of a video are worth posing: the sharpest of each stretch in which the view has moved enough.
 
 Sharpness is the variance of the Laplacian (Pech-Pacheco et al. 2000), movement the median displacement of points that
 are tracked from the last chosen frame (Lucas-Kanade, kept where tracking back returns).
@@ -36,9 +36,9 @@ class _Candidate:
 
 
 def choose_frames(frames: Iterable[SourceFrame]) -> Iterator[SourceFrame]:
-    """Choose frames of a film, in its order, holding one at a time.
+    """Choose frames of a video, in its order, holding one at a time.
 
-    The first stretch begins with the film and is half as long; the last one ends with it.
+    The first stretch begins with the video and is half as long; the last one ends with it.
     """
     reference: Reference | None = None
     near, far = 0.0, FAR - NEAR

@@ -21,7 +21,7 @@ from mambaloc.importing.registry import read_capture
 from mambaloc.importing.report import write_report
 from mambaloc.importing.splits.advisor import propose
 from mambaloc.importing.splits.selection import ASKED, Chosen, Proposal, choose
-from mambaloc.importing.undistort.pictures import Written, write_pictures
+from mambaloc.importing.undistort.images import Written, write_images
 from mambaloc.importing.world import in_its_world
 
 _MOST_SCALE = 1e6
@@ -47,7 +47,7 @@ def import_scene(
         metres_per_unit: what the source's unit is; as the source tells unless given.
         split: of :data:`~mambaloc.importing.splits.selection.ASKED`.
         command: that this was asked for with.
-        with_adjusted: also write poses that are adjusted to the pictures, in a file of their own.
+        with_adjusted: also write poses that are adjusted to the images, in a file of their own.
         images: the folder of the capture's images, where its format names them by paths; found unless given.
         topics: what to read of a ROS bag.
 
@@ -67,7 +67,7 @@ def import_scene(
     named = capture.left_out
     capture, lost = in_its_world(capture, metres_per_unit)
     with whole_folder(out, "choose another folder with --out") as partial:
-        written = write_pictures(capture, partial)
+        written = write_images(capture, partial)
         imported = _checked(written, {**named, **lost, **written.rules}, split, with_adjusted)
         write_frames(imported, partial)
         if imported.capture.tracks:

@@ -80,7 +80,7 @@ FORMATS: dict[str, Format] = {
         seven_scenes.read_seven_scenes,
     ),
     "map_free": Format(
-        "poses.txt and intrinsics.txt of Map-free, with a picture's name in each line",
+        "poses.txt and intrinsics.txt of Map-free, with an image's name in each line",
         map_free.is_map_free,
         map_free.read_map_free,
         True,
@@ -107,7 +107,7 @@ FORMATS: dict[str, Format] = {
     "tum": Format("a .tum or trajectory.txt beside images", tum.is_tum, tum.read_tum),
     "kitti_poses": Format("a .kitti or poses.txt beside images", kitti.is_kitti_poses, kitti.read_kitti_poses),
     "pose_lines": Format(
-        "lines of a 4x4 matrix, or of a picture's name and a pose, beside images",
+        "lines of a 4x4 matrix, or of an image's name and a pose, beside images",
         pose_lines.is_pose_lines,
         pose_lines.read_pose_lines,
         True,
@@ -119,14 +119,14 @@ FORMATS: dict[str, Format] = {
         "the same", _by_name_alone, partial(pose_lines.read_pose_lines, direction="cam_from_world"), True
     ),
     "pose_files": Format(
-        "a pose file beside each picture, as in a sequence of 7-Scenes",
+        "a pose file beside each image, as in a sequence of 7-Scenes",
         pose_files.is_pose_files,
         pose_files.read_pose_files,
     ),
     "pose_files_cam_from_world": Format(
         "the same", _by_name_alone, partial(pose_files.read_pose_files, direction="cam_from_world")
     ),
-    "structure_from_motion": Format("a film or pictures alone", structure.is_pictures, structure.read_structure),
+    "structure_from_motion": Format("a video or images alone", structure.is_video_or_images, structure.read_structure),
 }
 """By name, the most telling first: the first that matches a source is taken."""
 

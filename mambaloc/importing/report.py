@@ -27,7 +27,7 @@ _IN_TERMINAL = (
 
 
 def write_report(imported: Imported, folder: Path, name: str) -> None:
-    """Write ``report.md``, ``trajectory.png`` and, where pictures were compared with poses, ``agreement.png``.
+    """Write ``report.md``, ``trajectory.png`` and, where images were compared with poses, ``agreement.png``.
 
     Args:
         imported: what was found.
@@ -58,7 +58,7 @@ def write_report(imported: Imported, folder: Path, name: str) -> None:
             (FOCALS * found.focal_px, found.focal_share, found.focal_px, found.focal * found.focal_px),
             None if depth is None else (SCALES, depth.focal_px, depth.turn_px),
             folder / AGREEMENT_FILE,
-            f"{name}: do the poses agree with the pictures?",
+            f"{name}: do the poses agree with the images?",
             imported.unit,
         )
 
@@ -154,7 +154,7 @@ def _page(imported: Imported, name: str) -> str:
 
 
 def _of_agreement(found: Agreement, unit: str) -> list[str]:
-    """The section on poses and pictures."""
+    """The section on poses and images."""
     header = ["baseline", "turn", "pairs", "matches", "agree", "could agree"]
     rows = [
         [f"{_between(each)} {unit}", f"{each.turn_deg:.0f}°", str(each.pairs), str(each.matches), f"{each.share:.0%}",
@@ -162,10 +162,10 @@ def _of_agreement(found: Agreement, unit: str) -> list[str]:
         for each in found.bins
     ]  # fmt: skip
     parts = [
-        "## Poses and pictures",
+        "## Poses and images",
         f"![Matches that agree, by baseline and by focal length]({AGREEMENT_FILE})",
         f"A match agrees where it lies within {NEAR_PX:g} px of the line that the poses draw for it, were the longer "
-        "side of the pictures 640 px. It could agree where a pose fitted to its two pictures alone explains it: the "
+        "side of the images 640 px. It could agree where a pose fitted to its two images alone explains it: the "
         "rest is wrongly matched. Where much less agrees than could, poses or intrinsics are off.",
     ]
     if found.adjusted is not None:
@@ -182,7 +182,7 @@ def _of_agreement(found: Agreement, unit: str) -> list[str]:
         held = "the given poses and depth" if adjusted.with_depth else "the given poses"
         parts.append(
             f"`{ADJUSTED_FILE}` has adjusted poses, which nothing uses unless it is renamed to `frames.csv`. They are "
-            f"held by {held}: pictures alone prefer turns that are too small where baselines are small, and bend the "
+            f"held by {held}: images alone prefer turns that are too small where baselines are small, and bend the "
             f"map. Here turns between frames are {adjusted.turns:.3g} of those given."
         )
         if adjusted.focal:

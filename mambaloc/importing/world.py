@@ -10,7 +10,7 @@ import numpy as np
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks import sanity
 from mambaloc.importing.checks.fixes import astray, without_fix
-from mambaloc.importing.undistort.pictures import selected
+from mambaloc.importing.undistort.images import selected
 from mambaloc.runtime.world import World
 
 _FAR = 1000.0

@@ -1,7 +1,7 @@
-"""Bundle adjustment: poses, points and lenses that agree with the pictures, held near what was given.
+"""Bundle adjustment: poses, points and lenses that agree with the images, held near what was given.
 
-Given poses drift, so that no points fit all pictures that were posed with them. Adjusted poses do. How far each moved
-is the drift, and :mod:`mambaloc.runtime.maps.drift` carries answers back to the frame of the given poses. From pictures
+Given poses drift, so that no points fit all images that were posed with them. Adjusted poses do. How far each moved
+is the drift, and :mod:`mambaloc.runtime.maps.drift` carries answers back to the frame of the given poses. From images
 alone small baselines would bend the map, so the given poses and the given cameras are priors, and so are depths where
 they were measured.
 

@@ -19,7 +19,7 @@ from mambaloc.errors import InputError
 from mambaloc.images import Image
 from mambaloc.mapping.choosing import bytes_each, most_useful
 from mambaloc.mapping.given_points import described
-from mambaloc.mapping.kept_parts import kept_keypoints, kept_matches, picture_name
+from mambaloc.mapping.kept_parts import image_name, kept_keypoints, kept_matches
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.structure import Structure, recover_structure
@@ -88,7 +88,7 @@ class MapSettings:
 
     Args:
         key_frames: how many, at most.
-        width: of the pictures in which keypoints are searched, in pixels; narrower ones are searched as they are.
+        width: of the images in which keypoints are searched, in pixels; narrower ones are searched as they are.
         most_bytes: budget of points and descriptors.
         least_inliers: how many inliers a pose needs to be accepted.
         seed: of the views that triangulation draws.
@@ -184,7 +184,7 @@ def _searched(
     scene: str, key: PosedFrames, pairs: Indices, width: int, threads: int | None
 ) -> tuple[list[Features], list[Indices]]:
     """Keypoints of key frames, and the matches of each pair; pairs are ordered by their first frame."""
-    names = [picture_name(image, width) for image in key.images]
+    names = [image_name(image, width) for image in key.images]
     others = np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, len(key))))
 
     def searched(row: int) -> Features:
@@ -199,7 +199,7 @@ def _searched(
         if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
             raise InputError(
                 f"{scene}: its frames have {keypoints:.0f} keypoints each. "
-                "Film surfaces with more texture, or give larger pictures and a larger width."
+                "Film surfaces with more texture, or give larger images and a larger width."
             )
         matches = _each(pool, matched, range(len(key)), "matches")
     return features, list(itertools.chain.from_iterable(matches))
@@ -213,7 +213,7 @@ def _check_enough(scene: str, structure: Structure, least: int) -> None:
     if structure.agreeing < _LEAST_AGREEING:
         raise InputError(
             f"{scene}: {100 * structure.agreeing:.0f} % of the matches between its frames agree with their poses. "
-            "Check that poses and intrinsics belong to the pictures."
+            "Check that poses and intrinsics belong to the images."
         )
     if (points := len(structure.points_m)) < least:
         raise InputError(f"{scene}: its frames give {points} points. Give more frames, taken from further apart.")

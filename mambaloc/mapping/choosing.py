@@ -11,13 +11,13 @@ from mambaloc.mapping.triangulation import Observations
 
 Indices = NDArray[np.int64]
 
-_CELLS = 8  # across a picture's width
+_CELLS = 8  # across an image's width
 
 
 def most_useful(seen: Observations, points: int, most: int, width: float) -> Indices:
-    """Choose points greedily, so that each part of each key frame's picture keeps some.
+    """Choose points greedily, so that each part of each key frame's image keeps some.
 
-    Pictures are divided into square cells, eight across. A point is worth the sum over the cells that it is seen in of
+    Images are divided into square cells, eight across. A point is worth the sum over the cells that it is seen in of
     ``1 / (1 + n)``, where n points of that cell were chosen before: many views count, and more where little is known
     yet. It is the greedy cover of Li et al. 2010 ("Location Recognition using Prioritized Feature Matching"), with a
     count that grows instead of a fixed K.
@@ -32,7 +32,7 @@ def most_useful(seen: Observations, points: int, most: int, width: float) -> Ind
         seen: where key frames see which point.
         points: how many there are.
         most: how many to keep.
-        width: of the pictures, in the plane at depth 1.
+        width: of the images, in the plane at depth 1.
 
     Returns:
         Rows of points, those that most key frames see first; in no order where as many see them.

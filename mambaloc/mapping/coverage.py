@@ -76,7 +76,7 @@ class Outlook:
         return np.maximum.reduceat(np.exp(-(turn**2) - octaves**2), self._first)
 
     def _is_inside(self, towards: Floats, rotations: Floats) -> NDArray[np.bool_]:
-        """Which directions (P, 3) each picture shows, (N, P)."""
+        """Which directions (P, 3) each image shows, (N, P)."""
         cam = np.einsum("pi,nij->jnp", towards, rotations)
         (fx, fy), (cx, cy) = np.diag(self.map.intrinsics)[:2], self.map.intrinsics[:2, 2]
         x, y, depth = fx * cam[0], fy * cam[1], cam[2]

@@ -92,19 +92,19 @@ def localize_frames(
     intrinsics: Floats,
     priors: Sequence[CameraPose | None] | None = None,
 ) -> tuple[list[MapLocalization], Floats]:
-    """Localize pictures one after another.
+    """Localize images one after another.
 
     Args:
         localizer: in the map.
         images: paths or RGB arrays (H, W, 3), N of them.
         intrinsics: (N, 3, 3).
-        priors: a pose to search around, of each picture that has one.
+        priors: a pose to search around, of each image that has one.
 
     Returns:
-        The answers, and the seconds that each took on one core, without decoding the picture, (N,).
+        The answers, and the seconds that each took on one core, without decoding the image, (N,).
 
     Raises:
-        InputError: for a bad picture.
+        InputError: for a bad image.
     """
     found, cpu_s = [], []
     rows = zip(images, intrinsics, priors or [None] * len(images), strict=True)
@@ -119,7 +119,7 @@ def localize_frames(
 
 @contextmanager
 def _on_one_core() -> Iterator[None]:
-    """Keep OpenCV from sharing small pictures among threads, which takes more CPU time in all."""
+    """Keep OpenCV from sharing small images among threads, which takes more CPU time in all."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -228,7 +228,7 @@ def measure_saved(path: Path, recipe: MapRecipe, test: PosedFrames, making: Maki
         making: how the map was made.
 
     Raises:
-        InputError: for a map or a picture that cannot be read, or a folder that cannot be written.
+        InputError: for a map or an image that cannot be read, or a folder that cannot be written.
     """
     sparse_map = SparseMap.load(path)
     started = time.perf_counter()

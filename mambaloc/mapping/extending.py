@@ -22,7 +22,7 @@ from mambaloc.runtime.maps.viewpoints import spread_m
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
 
-# How far a match may be from its epipolar line, and a point from where it is seen, in pixels of a picture of 160, by
+# How far a match may be from its epipolar line, and a point from where it is seen, in pixels of an image of 160, by
 # round: frames that were found one after another drift at first.
 _NEAR_PX = (12.0, 4.0, 2.0)
 _SIGMA = 0.125  # of that

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.floating[Any]]
 
-_NEAR_PX = 1.0  # from a keypoint to where a point is seen, in pixels of a picture of 160
+_NEAR_PX = 1.0  # from a keypoint to where a point is seen, in pixels of an image of 160
 
 
 def described(tracks: Tracks, features: Sequence[Features], world_from_cam: Floats) -> Structure:

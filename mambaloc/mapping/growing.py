@@ -241,7 +241,7 @@ def _why_none(session: str, frames: int, contradict: int) -> str:
     if contradict:
         return (
             f"{session}: its poses contradict the map, which finds {contradict} of {frames} frames elsewhere. "
-            "Give the pictures' folder, without poses."
+            "Give the images' folder, without poses."
         )
     return (
         f"{session}: the map finds none of {frames} frames. Check that they show the same place and that --intrinsics "

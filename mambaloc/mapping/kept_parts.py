@@ -1,7 +1,7 @@
 """Keypoints and matches of key frames, kept in the user's cache: a build goes on where an earlier one stopped.
 
-Each part is named by what it was made from: pictures, width, and the version of OpenCV. Builds that differ in poses,
-cameras, budgets or the number of key frames share what is the same. Pictures that are not files are searched each time.
+Each part is named by what it was made from: images, width, and the version of OpenCV. Builds that differ in poses,
+cameras, budgets or the number of key frames share what is the same. Images that are not files are searched each time.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ Indices = NDArray[np.int64]
 _VERSION = f"1 OpenCV {cv2.__version__}"
 
 
-def picture_name(image: Path | Image, width: int) -> str | None:
-    """What the keypoints of a picture are kept under; None for an array, whose keypoints are not kept."""
+def image_name(image: Path | Image, width: int) -> str | None:
+    """What the keypoints of an image are kept under; None for an array, whose keypoints are not kept."""
     return _digest(str(width).encode(), fingerprint(image)) if isinstance(image, Path) else None
 
 
 def kept_keypoints(image: Path | Image, width: int, name: str | None) -> Keypoints:
-    """Keypoints of a picture.
+    """Keypoints of an image.
 
     Args:
         image: path or RGB array (H, W, 3).
-        width: of the picture in which they are searched, in pixels; a narrower one is searched as it is.
-        name: as :func:`picture_name` gives it.
+        width: of the image in which they are searched, in pixels; a narrower one is searched as it is.
+        name: as :func:`image_name` gives it.
 
     Raises:
-        InputError: for a bad picture, or where the cache cannot be written.
+        InputError: for a bad image, or where the cache cannot be written.
     """
 
     def make() -> dict[str, NDArray[Any]]:
@@ -50,11 +50,11 @@ def kept_keypoints(image: Path | Image, width: int, name: str | None) -> Keypoin
 
 
 def kept_matches(features: Sequence[Features], names: Sequence[str | None]) -> list[Indices]:
-    """Matches of the first picture's keypoints with those of each other one, rows of both (M, 2).
+    """Matches of the first image's keypoints with those of each other one, rows of both (M, 2).
 
     Args:
-        features: of the pictures.
-        names: of the pictures, as :func:`picture_name` gives them.
+        features: of the images.
+        names: of the images, as :func:`image_name` gives them.
 
     Raises:
         InputError: where the cache cannot be written.

@@ -1,4 +1,4 @@
-"""Frames to add to a map: of a scene with poses, of a folder of pictures, or of a film."""
+"""Frames to add to a map: of a scene with poses, of a folder of images, or of a film."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mambaloc.mapping.recipe import recipe_of
 from mambaloc.runtime.maps import CameraPose, MapLocalizer
 from mambaloc.runtime.sources import frames_of
 
-_MOST_FRAMES = 400  # of a film; two a second of three minutes
+_MOST_FRAMES = 400  # of a video; two a second of three minutes
 _FOCAL_SCALES = (0.7, 0.84, 1.0, 1.2, 1.44)
 _FOCAL_FRAMES = 8
 _CLEARLY_MORE = 1.3
@@ -36,21 +36,21 @@ def read_new_frames(
 
     Args:
         source: an imported scene's folder or a recipe, whose training frames have poses and cameras; a folder of
-            pictures, or a film, of which up to 400 frames are read.
+            images, or a video, of which up to 400 frames are read.
         localizer: in the map that they are for.
-        intrinsics: (3, 3) of the pictures; the map's camera unless given.
-        is_distorted: pictures are as the map's camera stores them, and are undistorted by its lens.
+        intrinsics: (3, 3) of the images; the map's camera unless given.
+        is_distorted: images are as the map's camera stores them, and are undistorted by its lens.
 
     Raises:
-        InputError: for what cannot be read; distorted pictures, where the map knows no lens or they have another shape
-            than its; pictures of another shape than the map's without intrinsics; and pictures that clearly fit another
+        InputError: for what cannot be read; distorted images, where the map knows no lens or they have another shape
+            than its; images of another shape than the map's without intrinsics; and images that clearly fit another
             focal length than the map's.
     """
     if source.suffix in (".yaml", ".yml") or (source.is_dir() and is_captured(source)):
         if intrinsics is not None:
             raise InputError(f"{source}: has intrinsics of its own. Leave out --intrinsics.")
         if is_distorted:
-            raise InputError(f"{source}: a scene's pictures have no distortion. Leave out --distorted.")
+            raise InputError(f"{source}: a scene's images have no distortion. Leave out --distorted.")
         return list(_posed(source, localizer))
     frames = list(_unposed(source, localizer, intrinsics, is_distorted))
     if intrinsics is None:
@@ -72,7 +72,7 @@ def _unposed(
     source: Path, localizer: MapLocalizer, intrinsics: NDArray[np.float64] | None, is_distorted: bool
 ) -> Iterator[NewFrame]:
     frames, count = frames_of(source)
-    if count is None:  # some films do not say; they are decoded twice
+    if count is None:  # some videos do not say; they are decoded twice
         count = sum(1 for _ in frames)
         frames = frames_of(source)[0]
     step = max(1, -(-count // _MOST_FRAMES))
@@ -85,7 +85,7 @@ def _unposed(
 
 
 def _check_focal_length(source: Path, localizer: MapLocalizer, frames: Sequence[NewFrame], remedy: str) -> None:
-    """Refuse pictures of another camera of the same shape, which would bend what they add."""
+    """Refuse images of another camera of the same shape, which would bend what they add."""
     some = [frames[row] for row in np.unique(np.linspace(0, len(frames) - 1, _FOCAL_FRAMES).round().astype(int))]
     inliers = {}
     for scale in _FOCAL_SCALES:
@@ -97,6 +97,6 @@ def _check_focal_length(source: Path, localizer: MapLocalizer, frames: Sequence[
     best = max(inliers, key=lambda scale: inliers[scale])
     if inliers[best] > _CLEARLY_MORE * inliers[1.0]:
         raise InputError(
-            f"{source}: its pictures fit a focal length about {best:g} times the map's. "
+            f"{source}: its images fit a focal length about {best:g} times the map's. "
             f"{remedy}: --intrinsics FX,FY,CX,CY."
         )

@@ -19,7 +19,7 @@ from mambaloc.runtime.maps.viewpoints import spread_m
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
 
-# How far a match may be from its epipolar line, and a point from where it is seen, in pixels of a picture of 160: by
+# How far a match may be from its epipolar line, and a point from where it is seen, in pixels of an image of 160: by
 # round, with the poses as given, which drift by that much, and with adjusted ones.
 _NEAR_PX = (4.0, 2.0)
 _SIGMA_PX = 0.5

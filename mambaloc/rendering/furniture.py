@@ -48,7 +48,7 @@ def chest(paint: Paint) -> Piece:
 
 
 def wardrobe(paint: Paint) -> Piece:
-    """A tall cupboard, its doors pasted over with pictures."""
+    """A tall cupboard, its doors pasted over with images."""
     width, height, depth = paint.rng.uniform(1.0, 1.4), paint.rng.uniform(1.8, 2.1), 0.58
     timber, doors = timber_color(paint), int(paint.rng.integers(2, 4))
     front = _fronts(paint, wood(paint, height, width, timber, 0.2).transpose(1, 0, 2).copy(), 1, doors)
@@ -239,7 +239,7 @@ def _fronts(paint: Paint, image: Image, rows: int, columns: int) -> Image:
 
 
 def _paste(surface: Image, picture: Image, center: ArrayLike) -> None:
-    """Stick a picture that fits onto a surface, ``centre`` as fractions of its width and height."""
+    """Stick an image that fits onto a surface, ``centre`` as fractions of its width and height."""
     (h, w), (rows, columns) = surface.shape[:2], picture.shape[:2]
     x, y = np.round(np.asarray(center) * (w, h) - np.array([columns, rows]) / 2).astype(int)
     target = surface[max(0, y) : y + rows, max(0, x) : x + columns]

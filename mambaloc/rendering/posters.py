@@ -1,4 +1,4 @@
-"""Pictures to hang on a wall, each painted once and never again: no two places of a room look alike."""
+"""Images to hang on a wall, each painted once and never again: no two places of a room look alike."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FILLED = (cv2.FILLED, cv2.LINE_AA)
 
 
 def poster(paint: Paint, width_m: float, height_m: float, kind: int) -> Image:
-    """A framed picture (H, W, 3); ``kind`` picks its genre, chance the rest."""
+    """A framed image (H, W, 3); ``kind`` picks its genre, chance the rest."""
     image = paint.canvas(width_m, height_m, paint.color(0.4, 0.8))
     art = _GENRES[kind % len(_GENRES)](paint, image)
     edge = paint.px(paint.rng.uniform(0.012, 0.03))

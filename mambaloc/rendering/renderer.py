@@ -16,7 +16,7 @@ from mambaloc.rendering.quads import Image, Room, Vectors
 
 NEAR_M = 0.02
 _TOUCH_PX = 1e-4  # quads cover what they touch, so that no crack opens where two of them meet
-_BORDER_PX = 4.0  # polygons are cut this far outside of the picture
+_BORDER_PX = 4.0  # polygons are cut this far outside of the image
 
 
 def default_intrinsics(size: tuple[int, int]) -> Vectors:
@@ -29,7 +29,7 @@ def default_intrinsics(size: tuple[int, int]) -> Vectors:
 def render(
     room: Room, intrinsics: ArrayLike, world_from_cam: ArrayLike, size: tuple[int, int], samples: int = 2
 ) -> tuple[Image, NDArray[np.float32]]:
-    """Picture and depth of a room as a pinhole camera sees them.
+    """Image and depth of a room as a pinhole camera sees them.
 
     Args:
         room: what there is to see.
@@ -63,7 +63,7 @@ def render(
 
 
 def sensor(rgb: Image, rng: np.random.Generator) -> Image:
-    """The picture as a small camera would record it: a little exposure wander and noise in each pixel."""
+    """The image as a small camera would record it: a little exposure wander and noise in each pixel."""
     gain = np.float32(rng.uniform(0.94, 1.06))
     noise = rng.standard_normal(rgb.shape, dtype=np.float32)
     return np.clip(rgb * gain + noise * np.float32(2.0), 0, 255).astype(np.uint8)
@@ -179,7 +179,7 @@ def _inverse_depth_where(texels_at_1m: float, level: int) -> float:
 
 
 def _lookup(target: Image, where: NDArray[np.bool_], texture: Image, quad_from_pixel: Vectors, window: Window) -> None:
-    """Copy a texture, seen through its homography, into the masked part of a window of the picture."""
+    """Copy a texture, seen through its homography, into the masked part of a window of the image."""
     columns, rows = np.flatnonzero(where.any(axis=0)), np.flatnonzero(where.any(axis=1))
     x0, x1, y0, y1 = columns[0], columns[-1] + 1, rows[0], rows[-1] + 1
     height, width = texture.shape[:2]

@@ -108,7 +108,7 @@ class _Deck:
 
 
 def _wall(paint: Paint, surface: Image, run: float, height: float, deck: _Deck, clearance: float) -> list[Quad]:
-    """A wall with furniture along it and pictures above the furniture, from (0, 0, 0) to (run, 0, height)."""
+    """A wall with furniture along it and images above the furniture, from (0, 0, 0) to (run, 0, height)."""
     quads: list[Quad] = []
     taken = []  # rectangles (left, bottom, right, top) of the wall that hold something
     x = clearance + paint.rng.uniform(0, 0.3)
@@ -136,7 +136,7 @@ def _apart(a: tuple[float, ...], b: tuple[float, ...], gap: float) -> bool:
 
 
 def _hang(surface: Image, picture: Image, x: int, y: int) -> None:
-    """Put a picture on a wall, over a soft shadow of itself."""
+    """Put an image on a wall, over a soft shadow of itself."""
     height, width = picture.shape[:2]
     edge = max(2, width // 24)
     below = surface[y : y + height + edge, x : x + width + edge]

@@ -29,7 +29,7 @@ class Pinhole:
     """Intrinsics without distortion.
 
     Args:
-        width: of its pictures, in pixels.
+        width: of its images, in pixels.
         height: likewise.
         focal_px: along x and y.
         centre_px: principal point, x and y.
@@ -78,10 +78,10 @@ class CameraModel(ABC):
 
     @abstractmethod
     def of_pixels(self, pinhole: Pinhole) -> NDArray[np.float32]:
-        """The same of the rays of all pixels of a pinhole's picture, (H, W, 2) float32, a hundred times as fast."""
+        """The same of the rays of all pixels of a pinhole's image, (H, W, 2) float32, a hundred times as fast."""
 
     def scaled(self, scale: Sequence[float]) -> Self:
-        """The same of pictures resized by factors of width and height."""
+        """The same of images resized by factors of width and height."""
         focal, center = scaled_intrinsics(self.focal_px, self.center_px, scale)
         return replace(self, focal_px=focal, center_px=center)
 
@@ -140,7 +140,7 @@ def is_same_shape(size: Sequence[float], other: Sequence[float]) -> bool:
 def scaled_intrinsics(
     focal_px: Sequence[float], center_px: Sequence[float], scale: Sequence[float]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Focal lengths and principal point in pictures resized by factors of width and height; corners stay corners."""
+    """Focal lengths and principal point in images resized by factors of width and height; corners stay corners."""
     (fx, fy), (cx, cy), (x, y) = focal_px, center_px, scale
     return (fx * x, fy * y), ((cx + CORNER_PX) * x - CORNER_PX, (cy + CORNER_PX) * y - CORNER_PX)
 
@@ -170,7 +170,7 @@ def pinhole_from_json(value: Mapping[str, Any]) -> Pinhole:
     width, height = int(value["width"]), int(value["height"])
     (fx, fy), (cx, cy) = (map(float, value[key]) for key in ("focal_px", "centre_px"))
     if not 1 <= min(width, height) <= max(width, height) <= LARGEST_SIDE_PX:
-        raise ValueError(f"pictures of {width}x{height}")
+        raise ValueError(f"images of {width}x{height}")
     if not all(abs(each) < _LARGEST for each in (fx, fy, cx, cy)) or min(fx, fy) <= 0:
         raise ValueError(f"focal length {fx}, {fy}, centre {cx}, {cy}")
     return Pinhole(width, height, (fx, fy), (cx, cy))

@@ -18,7 +18,7 @@ from mambaloc.runtime.world import World
 VERSION = 1
 _MOST_PIXELS = 8192  # of a side
 MOST_ENLARGED = 4
-"""How many times as large as the training camera's pictures another camera's are made at most; it bounds the memory."""
+"""How many times as large as the training camera's images another camera's are made at most; it bounds the memory."""
 METADATA_KEY = "mambaloc"
 IMAGE_INPUT = "image"
 """Name of the input of models that take what :class:`Preprocessing` makes of an image, in 0..1."""
@@ -104,7 +104,7 @@ class Contract:
             it is fed where the camera is unknown.
         pose: frame, units and order of its outputs.
         world: where the scene's frame lies in that of the data it was made of.
-        undistortion: how the training pictures were made of what their camera stored.
+        undistortion: how the training images were made of what their camera stored.
         scenes: of a model that knows several, in the order of its probabilities; poses are in the likeliest's frame.
     """
 

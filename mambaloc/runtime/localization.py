@@ -15,7 +15,7 @@ from mambaloc.runtime.maps.radii import covariance_radius
 Floats = NDArray[np.floating[Any]]
 
 _RIGHT_M, _RIGHT_DEG = 0.2, 5.0
-# That a network is right which states no radii. Pictures that a map rejects are bad: on none of 148 such pictures of
+# That a network is right which states no radii. Images that a map rejects are bad: on none of 148 such images of
 # frames held out of the embedded room was it right, nor was the map on the 66 of them to which it gave less than this.
 _UNSTATED = 0.1
 

@@ -28,7 +28,7 @@ class Localizer:
     """A network, and a sparse map beside it.
 
     The map's pose is the answer where it is accepted, or likelier to be right than the network's. What keeps the map
-    from being used, such as a damaged file or a picture whose camera is unknown, is a warning, and the network answers.
+    from being used, such as a damaged file or an image whose camera is unknown, is a warning, and the network answers.
 
     Args:
         model: an ``.onnx`` or ``.ort`` file that ``mambaloc export`` wrote; a bundle's folder; or a ``.safetensors``
@@ -79,7 +79,7 @@ class Localizer:
 
     @property
     def undistortion(self) -> Undistortion:
-        """How the training pictures were made of what their camera stored: as the network has it, or else the map."""
+        """How the training images were made of what their camera stored: as the network has it, or else the map."""
         told = [each.undistortion for each in (self.contract, self.sparse_map) if each is not None]
         return next((each for each in told if each.lens is not None), told[0])
 
@@ -91,13 +91,13 @@ class Localizer:
         return self._map.map
 
     def intrinsics_of(self, size: tuple[int, int]) -> NDArray[np.float64] | None:
-        """The training camera's pinhole matrix (3, 3) in pixels of its pictures of a size.
+        """The training camera's pinhole matrix (3, 3) in pixels of its images of a size.
 
         Args:
             size: (width, height).
 
         Returns:
-            None where neither a map with pictures of that shape nor the network says it.
+            None where neither a map with images of that shape nor the network says it.
         """
         if self._map is not None:
             width, height = self._map.map.size
@@ -131,7 +131,7 @@ class Localizer:
         start = time.perf_counter()
         if is_distorted:
             if intrinsics is not None:
-                raise InputError("intrinsics: of distorted pictures, the lens says them. Leave out one of the two.")
+                raise InputError("intrinsics: of distorted images, the lens says them. Leave out one of the two.")
             rgb, intrinsics = self.undistortion.apply(rgb, str(self._path))
         network = None if self._network is None else self._network.localize(rgb, intrinsics)
         in_map = self._localize_in_map(rgb, intrinsics, network)
@@ -194,14 +194,14 @@ class Localizer:
 
 
 def _warn_of_focal_length(found: MapLocalization) -> None:
-    """Where a pose would be accepted but for that; in steps of 5 %, so that a film's frames say it once."""
+    """Where a pose would be accepted but for that; in steps of 5 %, so that a video's frames say it once."""
     scale = found.focal_scale
     if scale is None or found.evidence is None or not found.evidence.is_enough:
         return
     off = f"about {5 * max(1, round(20 * abs(scale - 1)))} % too {'short' if scale > 1 else 'long'}"
     warnings.warn(
         f"intrinsics: the map's matches say that their focal length is {off}, so its poses are not accepted. "
-        "Give the intrinsics of these pictures.",
+        "Give the intrinsics of these images.",
         InputWarning,
         stacklevel=3,
     )

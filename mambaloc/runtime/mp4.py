@@ -1,4 +1,4 @@
-"""What an MP4 or QuickTime film says of itself and OpenCV does not pass on: how much of it is shown, and its light.
+"""What an MP4 or QuickTime video says of itself and OpenCV does not pass on: how much of it is shown, and its light.
 
 Boxes of ISO/IEC 14496-12: ``moov/mvhd`` has ticks a second, ``trak/edts/elst`` the parts that are shown, and ``colr``
 the colours, whose transfer is 16 for PQ and 18 for HLG (ITU-T H.273).
@@ -16,11 +16,11 @@ _HDR = {16: "PQ", 18: "HLG"}
 
 
 class About(NamedTuple):
-    """What a film says of itself.
+    """What a video says of itself.
 
     Args:
-        shown_s: how long its edit list shows its pictures; None where it has none.
-        hdr: the transfer of a film with a high dynamic range, ``PQ`` or ``HLG``; None for any other.
+        shown_s: how long its edit list shows its images; None where it has none.
+        hdr: the transfer of a video with a high dynamic range, ``PQ`` or ``HLG``; None for any other.
     """
 
     shown_s: float | None = None
@@ -28,7 +28,7 @@ class About(NamedTuple):
 
 
 def read_about(path: Path) -> About:
-    """Read what a film says of itself; nothing where it is of another format or damaged."""
+    """Read what a video says of itself; nothing where it is of another format or damaged."""
     try:
         moov = _moov(path)
         ticks_hz = next((_ticks_hz(moov[a:b]) for kind, a, b in _boxes(moov) if kind == b"mvhd"), 0)

@@ -1,4 +1,4 @@
-"""Frames one after another: of a video, a folder of pictures, or a camera."""
+"""Frames one after another: of a video, a folder of images, or a camera."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 
 from mambaloc.errors import InputError, InputWarning
-from mambaloc.images import PICTURES, Counts, Image, is_picture, pictures, read_image
+from mambaloc.images import IMAGE_SUFFIXES, Counts, Image, is_image, list_images, read_image
 from mambaloc.runtime.mp4 import read_about
 
 PICTURES_HZ = 30.0
-"""The rate at which a folder's pictures are taken to follow one another, as their files do not say it."""
+"""The rate at which a folder's images are taken to follow one another, as their files do not say it."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ def frames_of(
 ) -> tuple[Iterator[SourceFrame], int | None]:
     """Open a source; return its frames, and about how many there are where that is known.
 
-    A film's number is what its file says, less what it is trimmed by; those that are read may be fewer. A film with a
+    A video's number is what its file says, less what it is trimmed by; those that are read may be fewer. A video with a
     high dynamic range is an :class:`~mambaloc.errors.InputWarning`.
 
     Args:
-        source: a video file, a picture, a folder of pictures (in natural order of their names), or the number of a
+        source: a video file, an image, a folder of images (in natural order of their names), or the number of a
             camera, where no file or folder has that name.
-        pictures_hz: frames per second of a folder of pictures; a video and a camera have their own times.
-        counts: black and white of 16-bit pictures, as :func:`~mambaloc.images.read_image` takes them.
-        is_upright: turn a film's frames as the film asks; otherwise they are as it stores them.
+        pictures_hz: frames per second of a folder of images; a video and a camera have their own times.
+        counts: black and white of 16-bit images, as :func:`~mambaloc.images.read_image` takes them.
+        is_upright: turn a video's frames as the video asks; otherwise they are as it stores them.
 
     Raises:
         InputError: where there is no such source, it is empty, or ``pictures_hz`` is not positive.
@@ -57,34 +57,34 @@ def frames_of(
         raise InputError(f"pictures_hz={pictures_hz}: must be a positive number of frames per second; correct it")
     path = Path(source)
     if path.is_dir():
-        paths = pictures(path)
+        paths = list_images(path)
         if not paths:
-            raise InputError(f"{path}: holds no picture ({', '.join(PICTURES)}); give a folder of them or a video")
-        return _of_pictures(paths, pictures_hz, counts), len(paths)
+            raise InputError(f"{path}: holds no image ({', '.join(IMAGE_SUFFIXES)}); give a folder of them or a video")
+        return _of_images(paths, pictures_hz, counts), len(paths)
     if not path.is_file():
         if str(source).isdecimal():
             return _of_capture(_opened(int(str(source)), f"camera {source}"), live=True), None
         raise InputError(f"{path}: no such file, folder or camera; a camera is a number, as 0")
-    if is_picture(path):  # else FFmpeg would take one tile of a phone's HEIC for a film
-        return _of_pictures([path], pictures_hz, counts), 1
+    if is_image(path):  # else FFmpeg would take one tile of a phone's HEIC for a video
+        return _of_images([path], pictures_hz, counts), 1
     capture = _opened(str(path), str(path))
     if not is_upright:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     about = read_about(path)
     if about.hdr:
         warnings.warn(
-            f"{path}: is a film with a high dynamic range ({about.hdr}), whose frames look flat beside other pictures. "
-            "Record with HDR off, or convert it to SDR, and use such films alone for training and localizing.",
+            f"{path}: is a video with a high dynamic range ({about.hdr}), whose frames look flat beside other images. "
+            "Record with HDR off, or convert it to SDR, and use such videos alone for training and localizing.",
             InputWarning,
             stacklevel=2,
         )
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    if about.shown_s is not None:  # a trimmed film counts frames that it does not show
+    if about.shown_s is not None:  # a trimmed video counts frames that it does not show
         count = min(count, round(about.shown_s * capture.get(cv2.CAP_PROP_FPS)))
     return _of_capture(capture), count if count > 0 else None
 
 
-def _of_pictures(paths: list[Path], rate_hz: float, counts: Counts | None) -> Iterator[SourceFrame]:
+def _of_images(paths: list[Path], rate_hz: float, counts: Counts | None) -> Iterator[SourceFrame]:
     for number, path in enumerate(paths):
         yield SourceFrame(path.name, number / rate_hz, read_image(path, counts))
 
@@ -112,7 +112,7 @@ def _of_capture(capture: cv2.VideoCapture, live: bool = False) -> Iterator[Sourc
                 break
             stamp_s = time.monotonic() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000  # of the frame just read
             began_s = began_s if number else stamp_s
-            # Some streams have no stamps, and where films were joined they may start again.
+            # Some streams have no stamps, and where videos were joined they may start again.
             time_s = stamp_s - began_s if stamp_s - began_s > time_s else time_s + frame_s
             yield SourceFrame(str(number), time_s, image[..., ::-1])  # type: ignore[arg-type]
     finally:

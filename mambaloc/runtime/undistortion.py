@@ -1,4 +1,4 @@
-"""Pictures as a camera stores them, made those of a pinhole: one function for training pictures and for queries."""
+"""Images as a camera stores them, made those of a pinhole: one function for training images and for queries."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from mambaloc.runtime.camera_models import (
 )
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Columns and rows (H, W) of the stored picture, one of each for each pixel of the pinhole's."""
+"""Columns and rows (H, W) of the stored image, one of each for each pixel of the pinhole's."""
 
 FUNCTION = (
     "each pixel of 'leaves' is sampled where 'lens' projects its ray: OpenCV's initUndistortRectifyMap "
     "(cv2.fisheye's for a fisheye) as float32, then remap with INTER_LINEAR and BORDER_REPLICATE"
 )
-_MAPS_KEPT = 2  # each is as large as a few pictures
+_MAPS_KEPT = 2  # each is as large as a few images
 
 
 @dataclass(frozen=True)
 class Undistortion:
-    """How a scene's pictures were made of what their camera stored, where that is known and the same for all.
+    """How a scene's images were made of what their camera stored, where that is known and the same for all.
 
     Args:
         lens: of the camera; None where it is not known.
-        stored: (width, height) of the pictures that it stores.
-        leaves: the pinhole whose pictures are left, the middle of them where they were cropped.
+        stored: (width, height) of the images that it stores.
+        leaves: the pinhole whose images are left, the middle of them where they were cropped.
         unknown: why the lens is not known.
     """
 
@@ -53,29 +53,29 @@ class Undistortion:
     unknown: str = "none was kept with it"
 
     def apply(self, image: Image, where: str) -> tuple[Image, Floats]:
-        """Undistort a picture as the camera stores it, whole or resized.
+        """Undistort an image as the camera stores it, whole or resized.
 
         Args:
             image: (H, W, 3) or (H, W), ``uint8``.
             where: what carries this, for messages.
 
         Returns:
-            The picture as the scene's are, of their size times what this one was resized by; and its pinhole matrix,
+            The image as the scene's are, of their size times what this one was resized by; and its pinhole matrix,
             (3, 3).
 
         Raises:
-            InputError: where the lens is not known, or the picture has another shape than those that the camera stores.
+            InputError: where the lens is not known, or the image has another shape than those that the camera stores.
         """
         size = image.shape[1], image.shape[0]
         if self.lens is None or self.leaves is None:
             raise InputError(
-                f"{where}: the lens of its pictures is not known ({self.unknown}). Give pictures without distortion."
+                f"{where}: the lens of its images is not known ({self.unknown}). Give images without distortion."
             )
         if not is_same_shape(self.stored, size):
             (width, height), (own_width, own_height) = size, self.stored
             raise InputError(
-                f"{where}: a picture of {width}x{height} has another shape than {own_width}x{own_height}, which its "
-                "camera stores. Give whole pictures of that camera, or undistorted ones with their intrinsics."
+                f"{where}: an image of {width}x{height} has another shape than {own_width}x{own_height}, which its "
+                "camera stores. Give whole images of that camera, or undistorted ones with their intrinsics."
             )
         maps, pinhole = _fitted(self.lens, self.stored, self.leaves, size)
         return undistorted(image, maps), pinhole.intrinsics
@@ -107,26 +107,26 @@ class Undistortion:
         except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"lens: {type(error).__name__}: {error}") from None
         if left.width > stored[0] or left.height > stored[1]:
-            raise ValueError("lens: it leaves larger pictures than it is given")
+            raise ValueError("lens: it leaves larger images than it is given")
         corners = np.array([(x, y) for x in (0.0, left.width - 1) for y in (0.0, left.height - 1)])
         seen = lens((corners - left.center_px) / left.focal_px)
         if not ((seen > -1) & (seen < stored)).all():
-            raise ValueError("lens: its pictures do not fill those that are left")
+            raise ValueError("lens: its images do not fill those that are left")
         return cls(lens, stored, left, "")
 
 
 def undistorted(image: Image, maps: Maps) -> Image:
-    """A stored picture as a pinhole shows it, by what :func:`sampled_at` gives."""
+    """A stored image as a pinhole shows it, by what :func:`sampled_at` gives."""
     # The border's last hundredth of a pixel is rounding, and nothing to be black.
     return cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
 
 
 def sampled_at(projected: Callable[[Floats], Floats], pinhole: Pinhole) -> Maps:
-    """Where each pixel of a pinhole's picture lies in the stored one.
+    """Where each pixel of a pinhole's image lies in the stored one.
 
     Args:
         projected: stored pixels (N, 2) of rays (N, 2), such as a :class:`~mambaloc.runtime.camera_models.CameraModel`.
-        pinhole: of the picture that is wanted.
+        pinhole: of the image that is wanted.
     """
     if isinstance(projected, CameraModel):
         seen: NDArray[np.floating[Any]] = projected.of_pixels(pinhole)
@@ -141,7 +141,7 @@ def sampled_at(projected: Callable[[Floats], Floats], pinhole: Pinhole) -> Maps:
 
 @lru_cache(_MAPS_KEPT)
 def _fitted(lens: CameraModel, stored: Size, left: Pinhole, size: Size) -> tuple[Maps, Pinhole]:
-    """Maps of a stored picture that was resized to (width, height), and the pinhole that they leave."""
+    """Maps of a stored image that was resized to (width, height), and the pinhole that they leave."""
     if size != stored:
         scale = size[0] / stored[0], size[1] / stored[1]
         width, height = (max(1, round(side * by)) for side, by in zip(left.size, scale, strict=True))

@@ -84,7 +84,7 @@ def follow(
         out: the trajectory.
         filtering: one of :data:`FILTERS`; poses are written as found unless given.
         intrinsics: of every frame, (3, 3) in pixels; the training camera's unless given.
-        counts: black and white of 16-bit pictures, as the scene's were.
+        counts: black and white of 16-bit images, as the scene's were.
         is_distorted: frames are as the training camera stores them, and are undistorted by its lens.
         on_frame: is given each frame and what was found of it, unfiltered.
 

@@ -1,4 +1,4 @@
-"""An HTTP server of poses: a picture in the body, JSON out; built on Starlette and Uvicorn."""
+"""An HTTP server of poses: an image in the body, JSON out; built on Starlette and Uvicorn."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class Limits:
 
     Args:
         body_bytes: of a request, whatever its headers say.
-        pictures: of a request.
-        waiting: pictures that are localized or wait for it, beyond which requests are turned away with status 503.
-        is_distorted: pictures are as the training camera stores them, unless a request says otherwise.
+        images: of a request.
+        waiting: images that are localized or wait for it, beyond which requests are turned away with status 503.
+        is_distorted: images are as the training camera stores them, unless a request says otherwise.
     """
 
     body_bytes: int = 32 * 2**20
@@ -63,9 +63,9 @@ class _Metrics:
         self.registry = CollectorRegistry()
         told: dict[str, Any] = {"registry": self.registry, "namespace": "mambaloc"}
         self.requests = Counter("requests", "Requests to localize, by bundle and status", ("bundle", "status"), **told)
-        self.pictures = Counter("pictures", "Pictures, by bundle and what answered", ("bundle", "source"), **told)
-        self.seconds = Histogram("picture_seconds", "Of a picture, waiting included", ("bundle",), **told)
-        self.waiting = Gauge("pictures_waiting", "Pictures that are localized or wait for it", **told)
+        self.pictures = Counter("pictures", "Images, by bundle and what answered", ("bundle", "source"), **told)
+        self.seconds = Histogram("picture_seconds", "Of an image, waiting included", ("bundle",), **told)
+        self.waiting = Gauge("pictures_waiting", "Images that are localized or wait for it", **told)
         Gauge("workers", "Worker processes", **told).set(workers.count)
         replaced = Gauge("workers_replaced", "Workers that died or took too long", **told)
         replaced.set_function(lambda: workers.replaced)
@@ -78,7 +78,7 @@ class _Endpoints:
         self.waiting = 0
 
     async def localize(self, request: Request) -> Response:
-        """One picture, as the body; or several, as the files of a form, which are answered in their order."""
+        """One image, as the body; or several, as the files of a form, which are answered in their order."""
         name = request.path_params.get("bundle") or next(iter(self.workers.scenes))
         try:
             response = JSONResponse(await self._answers(request, name))
@@ -111,7 +111,7 @@ class _Endpoints:
         is_form = request.headers.get("content-type", "").startswith(_MULTIPART)
         pictures = await _within(_BODY_S, self._pictures(request, is_form))
         if self.waiting + len(pictures) > self.limits.waiting:
-            raise HTTPException(503, f"{self.waiting} pictures wait already. Try again later.", {"Retry-After": "1"})
+            raise HTTPException(503, f"{self.waiting} images wait already. Try again later.", {"Retry-After": "1"})
         answers = await asyncio.gather(
             *(self._localized(Task(name, each, intrinsics, is_distorted)) for each in pictures)
         )
@@ -122,13 +122,13 @@ class _Endpoints:
         return answers[0]
 
     def _is_distorted(self, text: str | None, intrinsics: _Matrix | None) -> bool:
-        """As a request says; unless it does, a picture with intrinsics of its own is a pinhole's."""
+        """As a request says; unless it does, an image with intrinsics of its own is a pinhole's."""
         if text is None:
             return self.limits.is_distorted and intrinsics is None
         if text not in ("true", "false"):
             raise HTTPException(400, "distorted: give true or false.")
         if text == "true" and intrinsics is not None:
-            raise HTTPException(400, "distorted: the lens says the intrinsics of distorted pictures. Leave out one.")
+            raise HTTPException(400, "distorted: the lens says the intrinsics of distorted images. Leave out one.")
         return text == "true"
 
     async def _pictures(self, request: Request, is_form: bool) -> list[bytes]:
@@ -143,7 +143,7 @@ class _Endpoints:
             raise HTTPException(400, f"body: is no form of at most {self.limits.pictures} files ({rule}).") from None
         files = [file for _, file in form.multi_items() if isinstance(file, UploadFile)]
         if not files:
-            raise HTTPException(400, "body: the form holds no file. Give a picture for each field.")
+            raise HTTPException(400, "body: the form holds no file. Give an image for each field.")
         try:
             return [await file.read() for file in files]
         finally:
@@ -156,7 +156,7 @@ class _Endpoints:
             size += len(chunk)
             if size > self.limits.body_bytes:
                 most = self.limits.body_bytes / 2**20
-                raise HTTPException(413, f"body: is larger than {most:g} MiB. Give smaller pictures, or fewer.")
+                raise HTTPException(413, f"body: is larger than {most:g} MiB. Give smaller images, or fewer.")
             yield chunk
 
     async def _localized(self, task: Task) -> Answer:
@@ -166,7 +166,7 @@ class _Endpoints:
         try:
             answer = await self.workers.localize(task)
         except WorkerLostError:
-            raise HTTPException(500, "picture: no worker could localize it. Report it, with the picture.") from None
+            raise HTTPException(500, "image: no worker could localize it. Report it, with the image.") from None
         finally:
             self.waiting -= 1
             self.metrics.waiting.set(self.waiting)
@@ -234,7 +234,7 @@ def serve_bundles(
         token: that requests must carry.
 
     Raises:
-        InputError: for a bundle that cannot be served, or that knows no lens where pictures are distorted; an address
+        InputError: for a bundle that cannot be served, or that knows no lens where images are distorted; an address
             that cannot be listened at; or no token where others than this machine reach the server.
     """
     if token is None and host not in LOOPBACK:
@@ -279,7 +279,7 @@ def _intrinsics(text: str | None) -> _Matrix | None:
     try:
         matrix = pinhole_matrix(text)
     except ArgumentTypeError:
-        raise HTTPException(400, "intrinsics: give FX,FY,CX,CY in pixels of the picture.") from None
+        raise HTTPException(400, "intrinsics: give FX,FY,CX,CY in pixels of the image.") from None
     if not np.isfinite(matrix).all():
         raise HTTPException(400, "intrinsics: give finite numbers.")
     return tuple(map(tuple, matrix.tolist()))

@@ -1,4 +1,4 @@
-"""Processes that localize pictures. One that dies or hangs is replaced, and its picture is tried again.
+"""Processes that localize images. One that dies or hangs is replaced, and its image is tried again.
 
 LitServe 0.2.19 and Ray Serve 2.60 were measured beside this (docs/serving.md): with the one, requests of a worker that
 is killed are not answered; with the other, an idle server takes 1.7 GiB.
@@ -29,7 +29,7 @@ from mambaloc.runtime.localization import Localization
 
 _TRIES = 3
 _START_S = 120.0
-_ENVIRONMENT = {  # of a worker: it has a core, and the memory of pictures that cameras take
+_ENVIRONMENT = {  # of a worker: it has a core, and the memory of images that cameras take
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "OPENCV_FOR_THREADS_NUM": "1",
@@ -37,16 +37,16 @@ _ENVIRONMENT = {  # of a worker: it has a core, and the memory of pictures that 
 }
 
 Answer = dict[str, Any]
-"""What is said of a picture, ready for JSON: its pose, or ``error``, the rule that it breaks."""
+"""What is said of an image, ready for JSON: its pose, or ``error``, the rule that it breaks."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A picture to localize.
+    """An image to localize.
 
     Args:
         bundle: name of the bundle.
-        picture: an encoded picture: JPEG, PNG and what else :func:`~mambaloc.images.decode_image` takes.
+        image: an encoded image: JPEG, PNG and what else :func:`~mambaloc.images.decode_image` takes.
         intrinsics: (3, 3) pinhole matrix in its pixels; the training camera's unless given.
         is_distorted: it is as the training camera stores it, and is undistorted by its lens.
     """
@@ -67,14 +67,14 @@ class Workers:
     Args:
         bundles: folders, or other models that :class:`~mambaloc.runtime.Localizer` takes, by name.
         count: how many processes.
-        seconds: that a picture may take before its worker is replaced.
+        seconds: that an image may take before its worker is replaced.
 
     Raises:
         InputError: for a bundle that cannot be served.
 
     Attributes:
         scenes: what each bundle knows, by the bundle's name.
-        without_lens: names of bundles that cannot undistort pictures.
+        without_lens: names of bundles that cannot undistort images.
         replaced: how many workers were replaced.
     """
 
@@ -111,7 +111,7 @@ class Workers:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def localize(self, task: Task) -> Answer:
-        """Localize a picture on the worker that is idle next.
+        """Localize an image on the worker that is idle next.
 
         Raises:
             WorkerLostError: where several workers, one after another, were lost with it.

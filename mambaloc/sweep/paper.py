@@ -87,7 +87,7 @@ def _basis_of(trial: StoredTrial, epoch: str) -> Basis:
     if data["official_split"]:
         frames = "official split"
     elif data.get("rendered"):
-        frames = "rendered pictures, not the benchmark's"
+        frames = "rendered images, not the benchmark's"
     else:
         frames = f"{data['scene']} with a split of its own, {train} training and {test} test frames: not the benchmark"
     network = f"{told.get('backbone', 'GoogLeNet')} at {data['image_size'][0]}x{data['image_size'][1]} px"

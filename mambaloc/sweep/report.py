@@ -111,13 +111,13 @@ def _with_maps(rows: Sequence[Row]) -> list[Section]:
     """The networks beside a map; nothing where none was built."""
     text = (
         "The map's pose where it is accepted, otherwise the network's. Means over seeds of the networks. A map has no "
-        "such seed; each picture was localized with one seed of RANSAC. Wrong: by more than 0.2 m or 5°. CPU time is "
+        "such seed; each image was localized with one seed of RANSAC. Wrong: by more than 0.2 m or 5°. CPU time is "
         "what the map took on all cores. The map alone is among the references."
     )
     header = [*rows[0].labels, "seeds"]
     for name in ERRORS:
         header += [f"network alone, {NAMES[name]}", f"network and map, {NAMES[name]}", "from", "to"]
-    table = [[*header, "worst (m)", "answered by the map", "of these wrong", "CPU ms a picture", "map (MiB)"]]
+    table = [[*header, "worst (m)", "answered by the map", "of these wrong", "CPU ms an image", "map (MiB)"]]
     for row in rows:
         if row.both is None:
             continue

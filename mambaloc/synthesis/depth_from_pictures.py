@@ -1,4 +1,4 @@
-"""Frames with depth, from posed pictures without any."""
+"""Frames with depth, from posed images without any."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MARGIN = 1.3
 _TRIAL_FRAMES, _TRIAL_OTHERS = 6, 1
 _TRIAL_RANGE = (0.2, 40.0)  # of how far the cameras are spread
 _LEAST_KNOWN = 0.05
-_AT_ONCE = 128  # pictures that are mapped
+_AT_ONCE = 128  # images that are mapped
 
 
 def depth_from_pictures(
@@ -33,19 +33,19 @@ def depth_from_pictures(
     settings: SweepSettings | None = None,
     device: torch.device | str = "cpu",
 ) -> PosedDepth:
-    """Search depth for some of the pictures, spread over the poses, and keep what several of them confirm.
+    """Search depth for some of the images, spread over the poses, and keep what several of them confirm.
 
     Args:
         images: (N, 3, h, w) uint8.
-        intrinsics: (N, 3, 3) in pixels of the pictures.
+        intrinsics: (N, 3, 3) in pixels of the images.
         world_from_cam: (N, 4, 4).
-        points_m: (M, 3), a sparse map's or of structure from motion: they bound the depth. From pictures unless given.
+        points_m: (M, 3), a sparse map's or of structure from motion: they bound the depth. From images unless given.
         key_frames: how many at most.
         settings: of the search.
         device: that searches.
 
     Raises:
-        InputError: where hardly any depth is confirmed: poses or cameras do not fit the pictures.
+        InputError: where hardly any depth is confirmed: poses or cameras do not fit the images.
     """
     small, matrices = searched(images, intrinsics)
     if points_m is None:
@@ -58,14 +58,14 @@ def depth_from_pictures(
     found = confirmed(PosedDepth(images[rows], depth_m, intrinsics[rows], world_from_cam[rows]))
     if np.isfinite(found.depth_m).mean() < _LEAST_KNOWN:
         raise InputError(
-            f"{len(images)} pictures: no depth is found that several of them confirm. Check poses and cameras, or "
+            f"{len(images)} images: no depth is found that several of them confirm. Check poses and cameras, or "
             "do without views."
         )
     return found
 
 
 def searched(images: NDArray[np.uint8], intrinsics: Floats) -> tuple[NDArray[np.uint8], Floats]:
-    """Pictures and their cameras at the size at which depth is searched: a whole part of theirs, about 54 pixels."""
+    """Images and their cameras at the size at which depth is searched: a whole part of theirs, about 54 pixels."""
     height, width = images.shape[2:]
     part = max(1, round(min(height, width) / _SEARCHED_PX))
     if part == 1:
@@ -105,7 +105,7 @@ def range_of_points(
 def range_from_pictures(
     images: NDArray[np.uint8], intrinsics: Floats, world_from_cam: Floats, device: torch.device | str = "cpu"
 ) -> tuple[float, float]:
-    """Nearest and farthest depth that a few pictures confirm, searched within what the cameras' spread suggests.
+    """Nearest and farthest depth that a few images confirm, searched within what the cameras' spread suggests.
 
     Raises:
         InputError: where they confirm none.
@@ -122,7 +122,7 @@ def range_from_pictures(
         known_m = known_m[np.isfinite(known_m)]
         if not len(known_m):
             raise InputError(
-                f"{len(images)} pictures: none confirms another's depth. Check poses and cameras, or do without views."
+                f"{len(images)} images: none confirms another's depth. Check poses and cameras, or do without views."
             )
         near_m, far_m = np.quantile(known_m, _POINTS_INSIDE)
         range_m = (near_m / _MARGIN, far_m * _MARGIN)

@@ -1,6 +1,6 @@
-"""Depth from posed pictures alone: plane sweep (Collins 1996) with semi-global aggregation (Hirschmuller 2008).
+"""Depth from posed images alone: plane sweep (Collins 1996) with semi-global aggregation (Hirschmuller 2008).
 
-Each picture is compared with neighbours warped through planes at evenly spaced inverse depths. Colours are normalised
+Each image is compared with neighbours warped through planes at evenly spaced inverse depths. Colours are normalised
 by their neighbourhood's mean and deviation, the best half of the neighbours counts (the others do not see the surface),
 and costs are aggregated along rows and columns, so that depth without texture follows from what surrounds it.
 """
@@ -30,7 +30,7 @@ class SweepSettings:
 
     Args:
         planes: at evenly spaced inverse depths.
-        neighbours: pictures that each is compared with, at most.
+        neighbours: images that each is compared with, at most.
         baseline: between them, in median depths, at best.
         window_px: side of the squares over which colours are normalised and compared.
         small_step: penalty of a step to the next plane between neighbouring pixels, in deviations.
@@ -46,11 +46,11 @@ class SweepSettings:
 
 
 class PlaneSweep:
-    """Depth of pictures from their neighbours.
+    """Depth of images from their neighbours.
 
     Args:
         images: (N, 3, h, w) uint8.
-        intrinsics: (N, 3, 3) in pixels of the pictures.
+        intrinsics: (N, 3, 3) in pixels of the images.
         world_from_cam: (N, 4, 4).
         range_m: nearest and farthest depth.
         settings: of the search.
@@ -73,12 +73,12 @@ class PlaneSweep:
         self._inverse = torch.linspace(1 / range_m[1], 1 / range_m[0], self.settings.planes, device=self.device)
 
     def depth_m(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Depth of some pictures, (R, h, w); NaN where they have no neighbours."""
+        """Depth of some images, (R, h, w); NaN where they have no neighbours."""
         found = [self._depth_of(row) for row in progress(rows.tolist(), "depth", len(rows))]
         return torch.stack(found).cpu().numpy()
 
     def neighbours(self, row: int) -> list[int]:
-        """Pictures that see a picture's surfaces from beside it, the best first, each from a place of its own."""
+        """Images that see an image's surfaces from beside it, the best first, each from a place of its own."""
         position_m, forward = self.world_from_cam[:, :3, 3], self.world_from_cam[:, :3, 2]
         offset = np.linalg.norm(position_m - position_m[row], axis=1) / self.scale_m
         turn_deg = np.degrees(np.arccos(np.clip(forward @ forward[row], -1, 1)))
@@ -112,7 +112,7 @@ class PlaneSweep:
         return (colors - mean) / (variance + _NOISE**2).sqrt()
 
     def _cost(self, picture: Tensor, row: int, image: Tensor, other: int) -> Tensor:
-        """How badly a neighbour, warped through each plane, fits a picture, (D, h, w); NaN where it does not see."""
+        """How badly a neighbour, warped through each plane, fits an image, (D, h, w); NaN where it does not see."""
         height, width = picture.shape[1:]
         other_from_cam = np.linalg.inv(self.world_from_cam[other]) @ self.world_from_cam[row]
         matrix = self.intrinsics[other] @ other_from_cam[:3, :3] @ np.linalg.inv(self.intrinsics[row])

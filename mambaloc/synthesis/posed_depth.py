@@ -16,11 +16,11 @@ Rows = NDArray[np.integer[Any]] | NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class PosedDepth:
-    """Small pictures with a depth for each pixel, cameras and poses.
+    """Small images with a depth for each pixel, cameras and poses.
 
     Shape:
         ``images`` (S, 3, h, w) uint8 RGB; ``depth_m`` (S, h, w) float32 along the optical axis, NaN where unknown;
-        ``intrinsics`` (S, 3, 3) in pixels of the pictures; ``world_from_cam`` (S, 4, 4). Metres stand for the unit of
+        ``intrinsics`` (S, 3, 3) in pixels of the images; ``world_from_cam`` (S, 4, 4). Metres stand for the unit of
         the poses, whatever it is.
     """
 

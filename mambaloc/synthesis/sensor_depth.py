@@ -12,13 +12,13 @@ from mambaloc.synthesis.posed_depth import Floats
 def carried_depth(
     depth_m: Floats, depth_intrinsics: Floats, intrinsics: Floats, size: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Depth of each pixel of a picture, from a depth camera that sits where the colour camera sits.
+    """Depth of each pixel of an image, from a depth camera that sits where the colour camera sits.
 
     Args:
         depth_m: (H, W), NaN where nothing was measured.
         depth_intrinsics: (3, 3) in pixels of ``depth_m``.
-        intrinsics: (3, 3) in pixels of the picture.
-        size: (height, width) of the picture.
+        intrinsics: (3, 3) in pixels of the image.
+        size: (height, width) of the image.
 
     Returns:
         (height, width), NaN where nothing was measured or the depth camera does not look.

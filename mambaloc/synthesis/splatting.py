@@ -1,4 +1,4 @@
-"""Views of a scene at poses where nobody took a picture, from frames with depth.
+"""Views of a scene at poses where nobody took an image, from frames with depth.
 
 The depth of the nearest frames is splatted into the new camera with a z-buffer, whose cracks are closed. Each pixel is
 then looked up in the frames: the best-ranked one whose depth agrees within 5 % gives its colour, between pixels.
@@ -132,7 +132,7 @@ class Splatter:
     def _views(
         self, frames: list[NDArray[np.int64]], to_view: Tensor, to_frames: Tensor, pixels: Tensor, most_holes: float
     ) -> tuple[Tensor, Tensor]:
-        """Pictures (V, 3, H, W) and depth (V, H, W) of views.
+        """Images (V, 3, H, W) and depth (V, H, W) of views.
 
         Args:
             frames: rows of those that each is made from, at most N, the best first.

@@ -145,7 +145,7 @@ def _accepted(
 def supported(
     splatter: Splatter, world_from_cam: Floats, intrinsics: Floats, size: tuple[int, int]
 ) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float16], Floats]]:
-    """Render views; yield picture, depth and pose of those with few holes, whose camera is before the surfaces."""
+    """Render views; yield image, depth and pose of those with few holes, whose camera is before the surfaces."""
     free = world_from_cam[splatter.is_free(world_from_cam[:, :3, 3])]
     for start in range(0, len(free), _RENDERED):
         poses = free[start : start + _RENDERED]

@@ -1,4 +1,4 @@
-"""Whether a capture's poses agree with its pictures: by how far pictures are apart, by focal length, by depth."""
+"""Whether a capture's poses agree with its images: by how far images are apart, by focal length, by depth."""
 
 from __future__ import annotations
 

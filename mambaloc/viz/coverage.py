@@ -110,7 +110,7 @@ def survey(sparse_map: SparseMap) -> Survey:
 def gaps(found: Survey, walked: Floats) -> list[Gap]:
     """Say where to film next: up to three places and directions where a camera would be lost, beside some where not.
 
-    From there a film starts in what the map knows, as growing it needs.
+    From there a video starts in what the map knows, as growing it needs.
 
     Args:
         found: the survey.

@@ -1,4 +1,4 @@
-"""Points of a sparse map over the pictures that show them."""
+"""Points of a sparse map over the images that show them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _FRAMES = 4
 
 @dataclass(frozen=True)
 class Seen:
-    """A picture with its keypoints.
+    """An image with its keypoints.
 
     Shape:
-        ``pixels`` (N, 2), in the picture; ``is_matched`` (N,).
+        ``pixels`` (N, 2), in the image; ``is_matched`` (N,).
 
     Args:
-        is_accepted: whether the map finds the picture.
+        is_accepted: whether the map finds the image.
     """
 
     image: Image
@@ -57,7 +57,7 @@ def write_points(maps: dict[str, SparseMap], frames: PosedFrames, path: Path, ti
 
 
 def look(localizer: MapLocalizer, image: Image, intrinsics: NDArray[np.float64]) -> Seen:
-    """Localize a picture, and keep which of its keypoints show a point of the map."""
+    """Localize an image, and keep which of its keypoints show a point of the map."""
     features = localizer.features(image, intrinsics)
     found = localizer.localize_features(features)
     is_matched = np.zeros(len(features), bool)
@@ -69,10 +69,10 @@ def look(localizer: MapLocalizer, image: Image, intrinsics: NDArray[np.float64])
 
 
 def draw_matches(rows: Mapping[str, Sequence[Seen]], path: Path, title: str) -> None:
-    """Draw pictures with their keypoints: matched ones in green, others in grey.
+    """Draw images with their keypoints: matched ones in green, others in grey.
 
     Args:
-        rows: the same pictures seen in one map or another, by what to call it.
+        rows: the same images seen in one map or another, by what to call it.
         path: the PNG to write.
         title: heads the plot.
     """

@@ -1,4 +1,4 @@
-"""Localized frames as a recording for the Rerun viewer: pictures, frusta, poses, their radii, the truth, and a map.
+"""Localized frames as a recording for the Rerun viewer: images, frusta, poses, their radii, the truth, and a map.
 
 Frames of reference are those of the rest of the package: the scene's frame in metres, ``world_from_cam``, and OpenCV's
 camera axes (x right, y down, z forward), which Rerun calls RDF. Rerun's quaternions are xyzw, and its pixels begin at
@@ -69,7 +69,7 @@ class RerunRecording:
         intrinsics: ArrayLike | None = None,
         truth: Pose | None = None,
     ) -> None:
-        """Add a frame and what was found of it; a frame without a pose shows its picture alone.
+        """Add a frame and what was found of it; a frame without a pose shows its image alone.
 
         Args:
             image: RGB (H, W, 3) or grey (H, W), ``uint8``, without distortion.
@@ -222,7 +222,7 @@ def _numbers(pose: Localization, truth: Pose | None) -> dict[str, float]:
 
 
 def _layout() -> Any:
-    """The scene on the left; the picture and the numbers on the right."""
+    """The scene on the left; the image and the numbers on the right."""
     import rerun.blueprint as rrb
 
     errors = [f"+ /{PLOTS}/{name}" for name in ("position_radius_m", "position_error_m")]

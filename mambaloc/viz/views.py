@@ -23,7 +23,7 @@ _TIGHT = {"left": 0.0, "right": 1.0, "bottom": 0.0, "top": 1.0, "wspace": 0.04, 
 
 @dataclass(frozen=True)
 class _Group:
-    """Strips of pictures (K, 3, h, w) below each other, each with a name, and a note below each column."""
+    """Strips of images (K, 3, h, w) below each other, each with a name, and a note below each column."""
 
     heading: str
     names: Sequence[str]

@@ -1,4 +1,4 @@
-"""From a picture to what a trained system takes, as in its training."""
+"""From an image to what a trained system takes, as in its training."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class Transform:
     preprocessing: Preprocessing
 
     def __call__(self, image: str | Path | Image) -> Tensor:
-        """Picture to (3, H, W), float32 RGB.
+        """Image to (3, H, W), float32 RGB.
 
         Args:
             image: a file, which is read upright; or ``uint8`` (H, W, 3) RGB, (H, W) grey or (H, W, 4).
 
         Raises:
-            InputError: where it is no whole picture.
+            InputError: where it is no whole image.
         """
         pixels = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
         cropped = self.preprocessing.apply(pixels)
@@ -40,21 +40,21 @@ class Transform:
 
 
 def create_transform(system: LitPoseRegressor) -> Transform:
-    """Make the transform of a trained system's pictures.
+    """Make the transform of a trained system's images.
 
     Systems that use a camera's intrinsics then take those of their training camera.
 
     Examples:
         >>> system = mambaloc.load("denseloc.embedded_room")
-        >>> prediction = system(mambaloc.create_transform(system)("picture.png")[None])
+        >>> prediction = system(mambaloc.create_transform(system)("image.png")[None])
 
     Args:
         system: as :func:`mambaloc.load` returns it.
 
     Raises:
-        InputError: for a system that was not trained, which has no size for pictures yet.
+        InputError: for a system that was not trained, which has no size for images yet.
     """
     short_side = system.provenance.get("data", {}).get("short_side")
     if short_side is None:
-        raise InputError(f"{system.registry_name}: does not say what pictures it was trained on. Load a trained one.")
+        raise InputError(f"{system.registry_name}: does not say what images it was trained on. Load a trained one.")
     return Transform(Preprocessing(short_side, system.image_size))

@@ -257,7 +257,7 @@ def test_pictures(suffix, scenes, tmp_path, fed):
         if isinstance(found := decode_image(file.read_bytes()), str):
             raise InputError(found)
 
-    fed(f"{suffix.upper()} picture", parse, path)
+    fed(f"{suffix.upper()} image", parse, path)
 
 
 def test_overlays(tmp_path, fed):

@@ -35,7 +35,7 @@ names = st.builds(
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder with a picture; beside it lies one that is not of it."""
+    """A folder with an image; beside it lies one that is not of it."""
     (tmp_path / "secret.png").write_bytes(PICTURE)
     (tmp_path / "scene/inside").mkdir(parents=True)
     for name in ("a.png", "inside/a.png"):

@@ -36,7 +36,7 @@ def tool(name: str, *words: object) -> None:
 
 
 def true_poses() -> np.ndarray:
-    """Of the camera at the pictures' times, by SciPy: poses of the base are halfway between these."""
+    """Of the camera at the images' times, by SciPy: poses of the base are halfway between these."""
     base, when = base_poses(), np.arange(FRAMES) + 0.5
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, :3, :3] = Slerp(np.arange(FRAMES + 1), Rotation.from_matrix(base[:, :3, :3]))(when).as_matrix()
@@ -77,7 +77,7 @@ def drive(made_once):
 
 
 def evaluated(path: Path) -> dict[int, tuple[float, float]]:
-    """Errors in metres and degrees, by the number of the picture in its topic."""
+    """Errors in metres and degrees, by the number of the image in its topic."""
     with path.open() as file:
         return {
             int(Path(row["image"]).stem): (float(row["position_error_m"]), float(row["rotation_error_deg"]))

@@ -1,4 +1,4 @@
-"""Tiny scenes written by hand: every picture is one colour that says which frame it is."""
+"""Tiny scenes written by hand: every image is one colour that says which frame it is."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-SIZE = (32, 24)  # width and height of the pictures
+SIZE = (32, 24)  # width and height of the images
 
 
 @dataclass
 class TinyScene:
-    """A written scene, and what was written: frames in reading order, which is also each one's id in its picture."""
+    """A written scene, and what was written: frames in reading order, which is also each one's id in its image."""
 
     folder: Path
     images: list[Path] = field(default_factory=list)

@@ -37,7 +37,7 @@ def noise(number: int, size: tuple[int, int] = SIZE) -> np.ndarray:
 
 @pytest.fixture
 def images(tmp_path: Path) -> list[Path]:
-    """Four PNG pictures of noise."""
+    """Four PNG images of noise."""
     folder = tmp_path / "den" / "seq-01"
     folder.mkdir(parents=True)
     paths = [folder / f"frame-{number:06d}.color.png" for number in range(4)]
@@ -53,7 +53,7 @@ def store(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Grows by one entry with each picture that OpenCV decodes."""
+    """Grows by one entry with each image that OpenCV decodes."""
     calls: list[int] = []
     decode = cv2.imdecode
     monkeypatch.setattr(cv2, "imdecode", lambda *args: calls.append(1) or decode(*args))
@@ -305,7 +305,7 @@ def test_a_read_only_cache_folder_is_an_input_error(images):
 
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="needs posix_fallocate")
 def test_a_full_disk_is_an_input_error(images, store, monkeypatch):
-    """Space is claimed before a picture is written: a memory map that runs out of it kills the process."""
+    """Space is claimed before an image is written: a memory map that runs out of it kills the process."""
 
     def disk_is_full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -1,4 +1,4 @@
-"""From a scene's folder to batches: each frame in its part, with its picture and its pose."""
+"""From a scene's folder to batches: each frame in its part, with its image and its pose."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def scene(write_tiny_scene):
 
 @pytest.fixture
 def make(scene, tmp_path) -> Callable[..., PoseDataModule]:
-    """Make a data module of the scene, with pictures of 21 x 16 pixels and crops of 12 x 12."""
+    """Make a data module of the scene, with images of 21 x 16 pixels and crops of 12 x 12."""
 
     def module(**options) -> PoseDataModule:
         options = {"scene": "den", "image_size": 12, "short_side": 16, "cache_dir": str(tmp_path / "cache"), **options}
@@ -39,7 +39,7 @@ def make(scene, tmp_path) -> Callable[..., PoseDataModule]:
 
 
 def ids_in(images: Tensor) -> list[int]:
-    """The frames that a batch of pictures shows: each is one colour, whose red is the frame's id."""
+    """The frames that a batch of images shows: each is one colour, whose red is the frame's id."""
     planes = images.flatten(2)
     assert (planes == planes[..., :1]).all()
     assert (planes[:, 1] == 128).all()
@@ -48,7 +48,7 @@ def ids_in(images: Tensor) -> list[int]:
 
 
 def collect(loader) -> tuple[list[int], Tensor]:
-    """Read all batches: the frames that the pictures show, and the batches' ``index``."""
+    """Read all batches: the frames that the images show, and the batches' ``index``."""
     batches = list(loader)
     return [i for batch in batches for i in ids_in(batch.image)], torch.cat([batch.index for batch in batches])
 
@@ -290,7 +290,7 @@ def test_training_batches_are_augmented_by_seed_epoch_and_index(make, monkeypatc
     ],
 )
 def test_a_crop_larger_than_the_images_is_refused(make, image_size, short_side, fits):
-    """The pictures are landscape: 21 x 16 once resized."""
+    """The images are landscape: 21 x 16 once resized."""
 
     def load() -> None:
         make(image_size=image_size, short_side=short_side).setup("fit")

@@ -15,7 +15,7 @@ from mambaloc.rendering import default_intrinsics
 
 
 def test_7scenes_has_one_color_camera(write_tiny_scene):
-    """525 px at a width of 640, the centre in the middle of the picture: here 32x24."""
+    """525 px at a width of 640, the centre in the middle of the image: here 32x24."""
     folder = write_tiny_scene({1: 3}).folder
     frames = seven_scenes.read_split(folder, "train", BadFrames())
     expected = [[26.25, 0, 15.5], [0, 26.25, 11.5], [0, 0, 1]]

@@ -1,4 +1,4 @@
-"""Holes of views, where they show nothing of the scene: other pictures of the batch fill them."""
+"""Holes of views, where they show nothing of the scene: other images of the batch fill them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UPRIGHT = torch.tensor([[1.0, 0, 0, 0]])
 
 
 def greys(*values):
-    """Pictures of one grey each, (B, 3, H, W) uint8."""
+    """Images of one grey each, (B, 3, H, W) uint8."""
     return torch.tensor(values, dtype=torch.uint8)[:, None, None, None].expand(-1, 3, *SIZE).contiguous()
 
 

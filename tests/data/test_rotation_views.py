@@ -24,7 +24,7 @@ NO_COLOR = torch.cat((torch.eye(3), torch.zeros(3, 1)), dim=1)
 
 
 def camera() -> np.ndarray:
-    """Its centre is not the picture's."""
+    """Its centre is not the image's."""
     matrix = default_intrinsics((SIZE[1], SIZE[0]))
     matrix[:2, 2] += (7, -4)
     return matrix

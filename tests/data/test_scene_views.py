@@ -325,7 +325,7 @@ def test_depth_that_cannot_be_used_gives_way_to_the_pictures_unless_it_was_asked
         "thousandth": disagrees,
         "thousandfold": disagrees,
         "empty": r"depth.png: depth has no measured pixel, and no other depth frame can be used. Mend them, or set",
-        "none": "no training frame has depth. Set data.view_depth to pictures",
+        "none": "no training frame has depth. Set data.view_depth to images",
         "few": "10 of 40 training frames have depth, too few",
     }[change]
     if change != "few":
@@ -339,11 +339,11 @@ def test_depth_that_cannot_be_used_gives_way_to_the_pictures_unless_it_was_asked
         make(root=root, cache_dir=str(tmp_path)).train_dataloader()
     (line,) = [str(each.message) for each in caught]
     assert re.search(expected, line) or change == "none"
-    assert line.endswith("pictures are searched. The training goes on without views.")
+    assert line.endswith("images are searched. The training goes on without views.")
 
 
 def stop_here(*args, **options):
-    raise InputError("pictures are searched.")
+    raise InputError("images are searched.")
 
 
 def test_poor_views_are_left_out_and_the_training_goes_on(make, tmp_path, monkeypatch):
@@ -362,9 +362,9 @@ def test_poor_views_are_left_out_and_the_training_goes_on(make, tmp_path, monkey
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"clip_length": 3}, "data.clip_length 3: data.views are single pictures"),
+        ({"clip_length": 3}, "data.clip_length 3: data.views are single images"),
         ({"views": -1}, "data.views -1: must be 0 or more"),
-        ({"view_depth": "lidar"}, "data.view_depth 'lidar': choose one of auto, sensor, pictures"),
+        ({"view_depth": "lidar"}, "data.view_depth 'lidar': choose one of auto, sensor, images"),
         ({"view_share": 1.0}, "data.view_share 1: must be 0 or more and less than 1"),
         ({"batch_size": 1}, "data.batch_size 1: has no room for a frame and a view"),
     ],
@@ -393,12 +393,12 @@ def test_assumed_camera_is_said_once(make, room_with_depth, tmp_path):
     data, said = lines_of(make, **options)
     assert len(said) == 1
     assert "does not say focal length and centre of camera 'colour'" in said[0]
-    assert said[0].endswith("A focal length of 0.87 of the pictures' longer side is assumed.")
+    assert said[0].endswith("A focal length of 0.87 of the images' longer side is assumed.")
     assert data.describe()["views"]["depth_frames"] == TRAIN // 2
 
 
 def test_where_views_and_points_cannot_be_had_the_training_goes_on_without_both(make, room_with_depth, tmp_path):
-    """Pictures of grey, without depth: nothing can be searched in them."""
+    """Images of grey, without depth: nothing can be searched in them."""
     root = copied(room_with_depth, tmp_path)
     for file in depth_files(root) + depth_files(root, 2):
         file.unlink()

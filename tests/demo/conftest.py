@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 
 import pytest
 
-from mambaloc.demo import build_site, embedded_film, serve
+from mambaloc.demo import build_site, embedded_video, serve
 from mambaloc.demo import film as film_module
 from mambaloc.demo.site import node_modules
 
@@ -88,10 +88,10 @@ def _export(out, root, scene, formats=("onnx",), raw_input=False, knows_its_fram
 
 @pytest.fixture(scope="session")
 def film():
-    """The film of the embedded scene, a tenth of its length."""
+    """The video of the embedded scene, a tenth of its length."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(film_module, "_FRAMES", 24)
-        return embedded_film()
+        return embedded_video()
 
 
 @pytest.fixture(scope="session")

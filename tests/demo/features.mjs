@@ -1,4 +1,4 @@
-// node features.mjs WEB FOLDER: grey pictures and keypoints that the page's modules make of FOLDER's pictures.
+// node features.mjs WEB FOLDER: grey images and keypoints that the page's modules make of FOLDER's images.
 import { readFile, writeFile } from "node:fs/promises";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";

@@ -1,4 +1,4 @@
-// node framing.mjs WEB < CASES: how the page's module resizes pictures, and the cameras that models are fed, as JSON.
+// node framing.mjs WEB < CASES: how the page's module resizes images, and the cameras that models are fed, as JSON.
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";

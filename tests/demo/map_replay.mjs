@@ -1,5 +1,5 @@
-// node map_replay.mjs MODULES WEB MAP PICTURE...: where the page's modules localize pictures in a map, as JSON; and on
-// the error stream the median CPU time of a picture, decoding left out, once the first ones have warmed the compiler up.
+// node map_replay.mjs MODULES WEB MAP IMAGE...: where the page's modules localize images in a map, as JSON; and on
+// the error stream the median CPU time of an image, decoding left out, once the first ones have warmed the compiler up.
 import { readFile } from "node:fs/promises";
 import { createRequire } from "node:module";
 import { join } from "node:path";

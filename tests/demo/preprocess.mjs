@@ -1,4 +1,4 @@
-// node preprocess.mjs WEB FOLDER: what the page's module makes of FOLDER's pictures, raw bytes in and floats out.
+// node preprocess.mjs WEB FOLDER: what the page's module makes of FOLDER's images, raw bytes in and floats out.
 import { readFile, writeFile } from "node:fs/promises";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";

@@ -1,6 +1,6 @@
-"""One film of each standard, decoded by Python's reader and by the browser: the same colours within 3 levels.
+"""One video of each standard, decoded by Python's reader and by the browser: the same colours within 3 levels.
 
-Node decodes no film; what the page's module makes of the same pixels there is compared in ``test_node.py``.
+Node decodes no video; what the page's module makes of the same pixels there is compared in ``test_node.py``.
 """
 
 from __future__ import annotations

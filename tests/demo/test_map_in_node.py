@@ -25,7 +25,7 @@ WEB = resources.files("mambaloc.demo") / "web"
 
 
 def pictures(den):
-    """Pictures with their scale: as it is; smaller by 4 and by an odd share; RGBA; too many keypoints; hardly any."""
+    """Images with their scale: as it is; smaller by 4 and by an odd share; RGBA; too many keypoints; hardly any."""
     room = read_image(sorted((den / "den/seq-02").glob("*.color.png"))[1])
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.normal(128, 60, (360, 480, 3)), None, 1.5)
@@ -40,7 +40,7 @@ def pictures(den):
 
 @pytest.fixture(scope="module")
 def found(den, tmp_path_factory, node):
-    """Each picture's grey one, keypoints and descriptors, by OpenCV and by the page."""
+    """Each image's grey one, keypoints and descriptors, by OpenCV and by the page."""
     folder, cases, expected = tmp_path_factory.mktemp("features"), [], []
     sift = cv2.SIFT.create(1000, contrastThreshold=0.02, enable_precise_upscale=True)
     for number, (picture, scale) in enumerate(pictures(den)):

@@ -47,7 +47,7 @@ def test_poses_through_another_lens_in_node_are_pythons(kind, model, bundles_for
         assert rotation_error_deg(np.array(pose["quaternion_wxyz"]), expected.quaternion) < 0.05
 
 
-CASES = [  # (height, width) of the picture, short side, crop
+CASES = [  # (height, width) of the image, short side, crop
     ((480, 640), 256, (224, 224)),
     ((240, 320), 78, (72, 96)),
     ((720, 1280), 78, (72, 96)),
@@ -79,7 +79,7 @@ def test_pictures_look_to_the_page_as_to_opencv(tmp_path, node):
 
 
 TRAINED = ((120.0, 0.0, 64.5), (0.0, 121.0, 47.0), (0.0, 0.0, 1.0))
-CAMERAS = [  # (height, width) of the picture, focal length and centre
+CAMERAS = [  # (height, width) of the image, focal length and centre
     ((480, 640), (533, 533, 322, 236)),
     ((480, 640), (426, 430, 322, 236)),
     ((480, 640), (700, 700, 322, 236)),
@@ -126,7 +126,7 @@ def code_of(page, language, holding):
 
 @pytest.fixture(params=["usual", "lenses"])
 def pictures(request):
-    """A bundle of models that take pictures as they are, and perhaps their cameras."""
+    """A bundle of models that take images as they are, and perhaps their cameras."""
     if request.param == "usual":
         return request.getfixturevalue("raw_bundle")
     return request.getfixturevalue("bundles_for_lenses") / "pictures"

@@ -270,7 +270,7 @@ def test_the_film_runs_beside_its_true_poses(opened, bundle, film):
         expected = {n: localizer.localize(pictures[n + shift][..., ::-1].copy()).position_m for n in found}
         near[shift] = np.median([np.linalg.norm(found[n] - expected[n]) for n in found])
     assert near[0] < 0.03  # decoders differ by centimetres
-    assert near[0] < min(near[-2], near[2])  # and the number is that of the picture
+    assert near[0] < min(near[-2], near[2])  # and the number is that of the image
     assert page.inner_text("[data-show=error-position]").endswith(" m")
 
 
@@ -285,7 +285,7 @@ def test_a_camera_is_localized(opened):
     ("shape", "message"),
     [
         ((120, 60, 3), "too narrow"),
-        (None, "no picture that this browser can read"),
+        (None, "no image that this browser can read"),
         ((120, 160, 4), "has transparent parts"),
     ],
 )

@@ -64,10 +64,10 @@ def test_what_is_refused(bundle, site, tmp_path):
 
     refused("give a bundle's folder", tmp_path / "none", tmp_path / "site")
     refused("is there already", bundle, site)
-    refused("no film", bundle, tmp_path / "site", tmp_path / "none.mp4")
-    refused("no film", bundle, tmp_path / "site", tmp_path)  # a folder is not copied whole
+    refused("no video", bundle, tmp_path / "site", tmp_path / "none.mp4")
+    refused("no video", bundle, tmp_path / "site", tmp_path)  # a folder is not copied whole
     (tmp_path / "film.md").write_text("words")
-    refused("no film", bundle, tmp_path / "site", tmp_path / "film.md")
+    refused("no video", bundle, tmp_path / "site", tmp_path / "film.md")
     changed = shutil.copytree(bundle, tmp_path / "changed")
     (changed / "trajectory.json").write_text("{}")
     refused("is not the file that the bundle was written with", changed, tmp_path / "site")

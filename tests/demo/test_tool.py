@@ -62,8 +62,8 @@ def test_unless_told_otherwise_it_shows_what_the_package_brings(demo, site, bund
     ("words", "message"),
     [
         (["none"], "give a bundle's folder"),
-        (["{bundle}", "--film", "none.mp4"], "none.mp4: no film"),
-        (["{bundle}", "--film", ""], "no film"),
+        (["{bundle}", "--film", "none.mp4"], "none.mp4: no video"),
+        (["{bundle}", "--film", ""], "no video"),
         (["{bundle}", "--port", "70000"], "from 0 to 65535"),
         (["{bundle}", "--out", "{bundle}"], "is there already"),
     ],

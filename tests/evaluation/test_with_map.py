@@ -46,7 +46,7 @@ def measured(trained_with_map, unsure, tmp_path_factory):
 
 
 def frames_of(run):
-    """Picture and true pose of each test frame."""
+    """Image and true pose of each test frame."""
     data = Checkpoint.read(run / "checkpoints/last.ckpt").data()
     folder = data.folder / "seq-02"
     poses = [np.loadtxt(path) for path in sorted(folder.glob("*.pose.txt"))]

@@ -46,7 +46,7 @@ def data(den):
 
 @pytest.fixture(scope="module", params=[False, True], ids=["tensors", "pictures"])
 def bundle(request, student, data, map_of_den, tmp_path_factory):
-    """With a map where the models take pictures, without one where they take tensors."""
+    """With a map where the models take images, without one where they take tensors."""
     folder, raw = tmp_path_factory.mktemp("bundles") / "new" / "bundle", request.param
     formats, sparse_map = ("onnx", "fp16", "ort"), map_of_den if raw else None
     deviations = write_bundle(student, data, folder, formats, raw_input=raw, sparse_map=sparse_map).deviations

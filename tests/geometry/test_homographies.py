@@ -66,7 +66,7 @@ def test_pictures_are_those_that_opencv_warps(dtype):
 
 
 def test_nothing_is_seen_of_what_lies_behind():
-    """Turned by 100 degrees, a wide camera sees a part of the picture at its side, and no mirror image of it."""
+    """Turned by 100 degrees, a wide camera sees a part of the image at its side, and no mirror image of it."""
     wide = torch.tensor([[[10.0, 0, 39.5], [0, 10, 29.5], [0, 0, 1]]], dtype=torch.float64)
     turn = torch.from_numpy(Rotation.from_euler("y", 100, degrees=True).as_matrix()[None])
     look_up = rotation_homography(wide, turn, wide)

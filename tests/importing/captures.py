@@ -1,4 +1,4 @@
-"""What tests of importing are made of: captures without pictures, and one whose lens is known."""
+"""What tests of importing are made of: captures without images, and one whose lens is known."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def told(folder: Path) -> dict[str, Any]:
 
 
 def capture_of(world_from_cam: NDArray[np.float64], **told) -> Capture:
-    """A capture without pictures."""
+    """A capture without images."""
     count = len(world_from_cam)
     values = {
         "kind": "test",

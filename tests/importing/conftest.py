@@ -1,4 +1,4 @@
-"""Captures made by hand and by the renderer: poses that are known, and pictures that are right for them."""
+"""Captures made by hand and by the renderer: poses that are known, and images that are right for them."""
 
 from __future__ import annotations
 

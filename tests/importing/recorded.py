@@ -1,4 +1,4 @@
-"""A known trajectory and its rendered pictures, which each test writes down in a format of its own."""
+"""A known trajectory and its rendered images, which each test writes down in a format of its own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _INSIDE_M = ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))
 
 @dataclass(frozen=True)
 class Recording:
-    """What a camera recorded: pictures as files' bytes, and where they were taken."""
+    """What a camera recorded: images as files' bytes, and where they were taken."""
 
     world_from_cam: NDArray[np.float64]
     jpegs: list[bytes]
@@ -33,7 +33,7 @@ class Recording:
         return Rotation.from_matrix(self.world_from_cam[:, :3, :3]).as_quat(canonical=True)
 
     def write(self, folder: Path, names: list[str]) -> list[Path]:
-        """Write the pictures under some names."""
+        """Write the images under some names."""
         paths = [folder / name for name in names]
         for path, data in zip(paths, self.jpegs, strict=True):
             path.parent.mkdir(parents=True, exist_ok=True)

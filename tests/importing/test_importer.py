@@ -156,7 +156,7 @@ def test_points_of_the_source_come_along(rendered_once, tmp_path, monkeypatch):
 
 def test_the_report_compares_poses_with_pictures(scene):
     report, checks = (scene / "report.md").read_text(), told(scene)["sanity"]["checks"]
-    assert "## Poses and pictures" in report
+    assert "## Poses and images" in report
     assert "![Matches that agree, by baseline and by focal length](agreement.png)" in report
     bins = checks["images and poses"]["by_baseline"]
     assert sum(each["matches"] for each in bins) > 1000
@@ -195,7 +195,7 @@ def test_adjusted_poses_are_written_beside_the_given(rendered, tmp_path):
     assert 0 < said["adjusted poses"]["moved"] < 0.03
     report = (tmp_path / "scene/report.md").read_text()
     assert "nothing uses unless it is renamed" in report
-    assert "pictures alone prefer turns that are too small" in report
+    assert "images alone prefer turns that are too small" in report
     # Cameras come into use with the poses, once the file is renamed, and not before.
     (scale,) = said["adjusted poses"]["focal_over_given"].values()
     given_px = focal_px(tmp_path / "scene")

@@ -1,4 +1,4 @@
-"""A lens from the capture to the query: pictures as the camera stores them are localized as the scene's own are."""
+"""A lens from the capture to the query: images as the camera stores them are localized as the scene's own are."""
 
 from __future__ import annotations
 
@@ -262,8 +262,8 @@ def test_wrong_uses_of_distorted_with_a_map_end_in_one_line(
     mapped, map_of_den, queries, imported_once, tmp_path, capsys
 ):
     for words, says in (
-        ((map_of_den, "--add", queries / "stored"), "the lens of its pictures is not known"),
-        ((mapped, "--add", imported_once), "a scene's pictures have no distortion. Leave out --distorted."),
+        ((map_of_den, "--add", queries / "stored"), "the lens of its images is not known"),
+        ((mapped, "--add", imported_once), "a scene's images have no distortion. Leave out --distorted."),
         ((mapped,), "--distorted: is of what --add adds. Leave it out."),
         ((mapped, "--add", queries / "stored", "--intrinsics", "140,140,80,60"), "not allowed with"),
     ):
@@ -280,8 +280,8 @@ def test_wrong_uses_end_in_one_line(mapped, map_of_den, queries, tmp_path, capsy
     narrow = tmp_path / "narrow.png"
     cv2.imwrite(str(narrow), np.zeros((90, 160, 3), np.uint8))
     for words, says in (
-        ((map_of_den, queries / "stored"), "the lens of its pictures is not known (their scene was not imported)"),
-        ((mapped, narrow), "a picture of 160x90 has another shape than 160x120"),
+        ((map_of_den, queries / "stored"), "the lens of its images is not known (their scene was not imported)"),
+        ((mapped, narrow), "an image of 160x90 has another shape than 160x120"),
         ((mapped, queries / "stored", "--intrinsics", "140,140,80,60"), "not allowed with"),
     ):
         with pytest.raises(SystemExit) as ended:

@@ -18,7 +18,7 @@ from mambaloc.images import read_image
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import FORMATS, Format, read_capture
-from mambaloc.importing.undistort.pictures import selected, write_pictures
+from mambaloc.importing.undistort.images import selected, write_images
 
 
 def test_bad_frames_are_left_out_and_named(rendered, tmp_path):
@@ -107,7 +107,7 @@ def test_a_photograph_with_exif_is_turned_as_its_camera_has_it(rendered_once, tm
     (tmp_path / "a.jpg").write_bytes(jpeg[:2] + segment + jpeg[2:])
     camera = Camera(*size, (140.0, 140.0), (size[0] / 2, size[1] / 2))
     capture = replace(capture, images=(tmp_path / "a.jpg",), cameras={"camera-1": camera})
-    written, sizes, rules, *_ = write_pictures(capture, tmp_path / "out")
+    written, sizes, rules, *_ = write_images(capture, tmp_path / "out")
     assert rules == {}
     assert sizes == [size]
     expected = stored if size == SIZE else np.rot90(stored, k=-1)
@@ -118,7 +118,7 @@ def test_names_are_made_safe_and_unique(rendered_once, tmp_path):
     capture = selected(read_capture(rendered_once.folder), [0, 1, 2, 3])
     names = ("../../up", "../../up", "a b/c", "a_b c")
     capture = replace(capture, sequences=names, images=(capture.images[0], capture.images[0], *capture.images[2:]))
-    written, *_ = write_pictures(capture, tmp_path / "out")
+    written, *_ = write_images(capture, tmp_path / "out")
     found = [path.relative_to(tmp_path / "out").as_posix() for path in written.images]
     assert found == [
         "images/up/0001.png", "images/up/0001-1.png", "images/a_b_c/0003.png", "images/a_b_c-2/0004.png",

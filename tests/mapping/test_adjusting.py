@@ -109,7 +109,7 @@ def test_exact_poses_stay(scene):
 
 
 def test_depth_holds_the_scale(scene):
-    """Everything is a tenth too large, which no picture can contradict; depth can."""
+    """Everything is a tenth too large, which no image can contradict; depth can."""
     given = scene.world_from_cam.copy()
     given[:, :3, 3] *= 1.1
     scales = []

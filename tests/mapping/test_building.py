@@ -77,7 +77,7 @@ def test_the_same_answer_comes_of_the_same_seed(room, other_walk):
 
 
 def test_a_larger_picture_and_a_part_of_one_are_localized(room, other_walk):
-    """Pictures of another size and aspect: twice as large; and the left three quarters, with the same camera."""
+    """Images of another size and aspect: twice as large; and the left three quarters, with the same camera."""
     image, k, truth = (
         other_walk.frames.images[4],
         other_walk.frames.intrinsics[4],
@@ -119,12 +119,12 @@ def test_a_picture_of_another_place_is_not_accepted(room):
 
 
 def test_another_shape_needs_its_camera(room):
-    with pytest.raises(InputError, match=r"picture of 120x160: .*Give its intrinsics"):
+    with pytest.raises(InputError, match=r"image of 120x160: .*Give its intrinsics"):
         MapLocalizer(room).localize(np.zeros((160, 120, 3), np.uint8))
 
 
 def test_another_cameras_intrinsics_are_refused(room, other_walk):
-    with pytest.raises(InputError, match=r"cannot be the camera of a picture of 160x120"):
+    with pytest.raises(InputError, match=r"cannot be the camera of an image of 160x120"):
         MapLocalizer(room).localize(other_walk.frames.images[0], np.diag((4, 4, 1)) @ other_walk.frames.intrinsics[0])
     with pytest.raises(InputError, match=r"cannot be the camera"):
         MapLocalizer(room).localize(other_walk.frames.images[0], np.zeros(3))
@@ -222,7 +222,7 @@ def test_pictures_are_not_enlarged(walk):
 
 @pytest.mark.parametrize(("off_m", "off_deg"), [(0.0, 0), (0.3, 8), (5.0, 170)])
 def test_a_prior_never_makes_an_answer_worse(room, other_walk, off_m, off_deg):
-    """Whether it is right, off, or wild; pictures of which a third is left."""
+    """Whether it is right, off, or wild; images of which a third is left."""
     localizer, frames = MapLocalizer(room), other_walk.frames
     for row in range(0, 16, 3):
         image, truth = frames.images[row].copy(), frames.world_from_cam[row]

@@ -22,7 +22,7 @@ def test_a_key_frame_that_sees_little_keeps_its_point():
 
 
 def test_each_part_of_a_picture_keeps_a_point():
-    """Points 0 to 2 lie within an eighth of the picture's width, point 3 in another eighth."""
+    """Points 0 to 2 lie within an eighth of the image's width, point 3 in another eighth."""
     rays = [(0.01, 0.01), (0.02, 0.02), (0.03, 0.03), (0.30, 0.01)]
     assert sorted(most_useful(_seen([0, 1, 2, 3], [0, 0, 0, 0], rays), 4, 2, 1.0)) == [0, 3]
     assert sorted(most_useful(_seen([0, 1, 2, 3], [0, 0, 0, 0], rays), 4, 2, 8.0)) == [0, 1]

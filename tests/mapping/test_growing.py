@@ -1,4 +1,4 @@
-"""Maps of a rendered room that grow by frames with exact poses, and by pictures alone."""
+"""Maps of a rendered room that grow by frames with exact poses, and by images alone."""
 
 import dataclasses
 
@@ -194,7 +194,7 @@ def test_a_long_film_is_thinned(part, walk, tmp_path, monkeypatch):
 
 
 def test_pictures_of_another_camera_are_refused_or_named(part, walk, tmp_path):
-    """The middle of each picture, enlarged: as with a lens of 1.44 times the focal length."""
+    """The middle of each image, enlarged: as with a lens of 1.44 times the focal length."""
     top, left = 18, 24
     for row in range(10, 26, 4):
         middle = walk.frames.images[row][top : 120 - top, left : 160 - left]
@@ -214,10 +214,10 @@ def test_pictures_of_another_camera_are_refused_or_named(part, walk, tmp_path):
 
 def test_pictures_of_another_shape_need_their_camera(part, tmp_path):
     cv2.imwrite(str(tmp_path / "tall.png"), np.zeros((160, 120, 3), np.uint8))
-    with pytest.raises(InputError, match=r"picture of 120x160: its shape differs .* Give its intrinsics"):
+    with pytest.raises(InputError, match=r"image of 120x160: its shape differs .* Give its intrinsics"):
         read_new_frames(tmp_path, MapLocalizer(part))
 
 
 def test_an_empty_folder_is_refused(part, tmp_path):
-    with pytest.raises(InputError, match=r"holds no picture"):
+    with pytest.raises(InputError, match=r"holds no image"):
         read_new_frames(tmp_path, MapLocalizer(part))

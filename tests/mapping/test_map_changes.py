@@ -30,7 +30,7 @@ def folder(part, tmp_path):
 
 @pytest.fixture(scope="module")
 def pictures(walk, tmp_path_factory):
-    """Pictures without poses, most of them of what the map does not know."""
+    """Images without poses, most of them of what the map does not know."""
     out = tmp_path_factory.mktemp("more") / "balcony"
     out.mkdir()
     for row in range(34, 48, 2):
@@ -83,7 +83,7 @@ def test_pictures_are_added_measured_and_removed_again(folder, pictures, den, tm
             ["--remove", "attic", "--out", "{out}"],
             r"attic: is not in the map of room\. Choose one of its sessions: none",
         ),
-        (["--add", "{empty}", "--out", "{out}"], r"holds no picture"),
+        (["--add", "{empty}", "--out", "{out}"], r"holds no image"),
         (["--add", "{out}/no.mp4", "--out", "{out}"], r"no such file"),
         (["--remove", "attic", "--out", "{out}", "--name", "attic"], r"--name: is of what --add adds\. Leave it out"),
         (["--intrinsics", "100,100,80,60"], r"--intrinsics: is of what --add adds\. Leave it out"),

@@ -1,4 +1,4 @@
-"""A map of pictures of two cameras, each with a matrix and a size of its own."""
+"""A map of images of two cameras, each with a matrix and a size of its own."""
 
 from dataclasses import replace
 
@@ -100,5 +100,5 @@ def test_the_other_cameras_matrix_is_seen_to_be_wrong(room, queries):
 
 def test_a_picture_of_another_shape_has_no_camera_by_default(room, queries):
     MapLocalizer(room).localize(queries.images[0])
-    with pytest.raises(InputError, match=r"picture of 120x160: .*Give its intrinsics"):
+    with pytest.raises(InputError, match=r"image of 120x160: .*Give its intrinsics"):
         MapLocalizer(room).localize(queries.images[1])

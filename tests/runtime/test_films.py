@@ -1,4 +1,4 @@
-"""Films: colours by their tag, trimmed ones by what they show, and a high dynamic range told once."""
+"""Videos: colours by their tag, trimmed ones by what they show, and a high dynamic range told once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from films import COLORS, colored_film, patches
 
 from mambaloc.errors import InputWarning
 from mambaloc.images import read_image
-from mambaloc.importing.film import write_frames
+from mambaloc.importing.video import write_frames
 from mambaloc.runtime.mp4 import About, read_about
 from mambaloc.runtime.sources import frames_of
 
@@ -39,7 +39,7 @@ def trimmed(path, start, count):
 
 
 def tagged(path, transfer):
-    """Add the box of colours, BT.2020 with some transfer, to a film's only track."""
+    """Add the box of colours, BT.2020 with some transfer, to a video's only track."""
     data = bytearray(path.read_bytes())
     box = struct.pack(">I8s3HB", 19, b"colrnclx", 9, transfer, 9, 0)
     entry = data.index(b"stsd") + 12
@@ -77,7 +77,7 @@ def test_a_high_dynamic_range_is_told_once(tmp_path, transfer, name):
     with pytest.warns(InputWarning) as told:
         frames_of(path)
     (warning,) = told
-    assert f"a.mp4: is a film with a high dynamic range ({name})" in str(warning.message)
+    assert f"a.mp4: is a video with a high dynamic range ({name})" in str(warning.message)
     assert "Record with HDR off" in str(warning.message)
 
 
@@ -98,9 +98,9 @@ def test_a_damaged_film_says_nothing_of_itself(tmp_path, at):
 
 @pytest.mark.parametrize("standard", ["bt601", "bt709"])
 def test_a_films_colors_are_those_of_its_tag(tmp_path, standard):
-    """Guess: OpenCV heeds a film's matrix. 4.12 takes every film for BT.601, up to 28 levels off; 5.0 heeds it.
+    """Guess: OpenCV heeds a video's matrix. 4.12 takes every video for BT.601, up to 28 levels off; 5.0 heeds it.
 
-    The film was made for these colours by the standard's matrix; its encoder is off by up to 5 levels itself.
+    The video was made for these colours by the standard's matrix; its encoder is off by up to 5 levels itself.
     """
     path = colored_film(tmp_path / "a.webm", standard)
     frames, _ = frames_of(path)

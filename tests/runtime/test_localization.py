@@ -38,7 +38,7 @@ FAMILIAR = replace(NETWORK, unfamiliarity=0.5)
 @pytest.mark.parametrize(
     ("network", "chance"),
     [
-        (NETWORK, 0.0),  # the picture does not look like the place
+        (NETWORK, 0.0),  # the image does not look like the place
         (FAMILIAR, (1 - 0.1**0.16) * (1 - 0.1 ** (25 / 81))),
         (replace(FAMILIAR, position_radius_m=0.2, rotation_radius_deg=5.0), 0.81),
         (replace(FAMILIAR, position_radius_m=0.02, rotation_radius_deg=0.5), 1.0),

@@ -83,7 +83,7 @@ def test_the_runtime_needs_no_torch(model, map_of_den, tmp_path):
     assert len(json.loads(result.stdout)) == 3
 
 
-# --- pictures of every kind ------------------------------------------------------------------------------------------
+# --- images of every kind ------------------------------------------------------------------------------------------
 
 
 def test_grey_and_transparent_pictures_are_rgb(model, tmp_path):
@@ -97,7 +97,7 @@ def test_grey_and_transparent_pictures_are_rgb(model, tmp_path):
 
 
 def test_a_turned_photograph_is_made_upright(tmp_path):
-    """EXIF orientation 6: the camera was turned, the picture must be turned back by 90 degrees."""
+    """EXIF orientation 6: the camera was turned, the image must be turned back by 90 degrees."""
     rgb = picture()
     _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1])
     exif = (
@@ -114,7 +114,7 @@ def test_a_turned_photograph_is_made_upright(tmp_path):
     ("content", "message"),
     [
         (b"", "cannot be decoded"),
-        (b"no picture", "cannot be decoded"),
+        (b"no image", "cannot be decoded"),
         (None, "cannot be read"),
         ("half", "truncated"),
     ],
@@ -334,8 +334,8 @@ def test_where_poses_go_is_asked_before_the_work(model, tmp_path):
 
 def test_what_is_no_source(tmp_path):
     (tmp_path / "empty").mkdir()
-    (tmp_path / "film.mp4").write_bytes(b"no film")
-    for source, message in (("empty", "holds no picture"), ("film.mp4", "cannot be opened"), ("none", "no such file")):
+    (tmp_path / "film.mp4").write_bytes(b"no video")
+    for source, message in (("empty", "holds no image"), ("film.mp4", "cannot be opened"), ("none", "no such file")):
         with pytest.raises(InputError, match=message):
             frames_of(tmp_path / source)
     for rate_hz in (0, -1, float("nan"), float("inf")):

@@ -108,7 +108,7 @@ def test_a_map_localizes_without_a_network(map_of_den, frame):
     lost = localizer.localize(GREY)
     assert lost.source is None
     assert np.isnan(lost.position_m).all()
-    with pytest.raises(InputError, match="its shape differs from the map's pictures of 160x120"):
+    with pytest.raises(InputError, match="its shape differs from the map's images of 160x120"):
         localizer.localize(np.zeros((72, 72, 3), np.uint8))
 
 
@@ -116,7 +116,7 @@ def test_a_map_localizes_without_a_network(map_of_den, frame):
 
 
 def test_a_picture_of_another_shape_needs_its_intrinsics(both, frame, map_of_den):
-    """The frame without its lowest 20 rows: the same camera, whose centre is no longer the picture's."""
+    """The frame without its lowest 20 rows: the same camera, whose centre is no longer the image's."""
     cut = read_image(frame)[:100]
     with pytest.warns(
         InputWarning, match=r"160x100: its shape differs .* The network answers without the map\."

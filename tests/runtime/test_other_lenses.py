@@ -1,4 +1,4 @@
-"""A model that takes intrinsics is given those of the network's input, whatever lens took the picture.
+"""A model that takes intrinsics is given those of the network's input, whatever lens took the image.
 
 What stands for a network answers with what it was given, so that no training is needed.
 """
@@ -36,7 +36,7 @@ ECHO = onnx.parser.parse_model("""
         quaternion_wxyz = Concat<axis = 1>(brightness, others)
     }
 """)
-"""Its position is the first row of the intrinsics; its quaternion the picture's mean, and the second row."""
+"""Its position is the first row of the intrinsics; its quaternion the image's mean, and the second row."""
 
 
 def written(path, contract, model=ECHO):
@@ -63,11 +63,11 @@ def camera(fx, cx, cy, fy=None):
     return np.array([[fx, 0, cx], [0, fy or fx, cy], [0, 0, 1.0]])
 
 
-LENSES = {  # (width, height) of the picture, and its camera
+LENSES = {  # (width, height) of the image, and its camera
     "the training camera": ((640, 480), camera(533, 322, 236)),
     "shorter": ((640, 480), camera(426, 322, 236)),
     "longer": ((640, 480), camera(666, 322, 236)),
-    "wide picture": ((1280, 720), camera(1066, 640, 360)),
+    "wide image": ((1280, 720), camera(1066, 640, 360)),
     "upright phone": ((480, 640), camera(533, 238, 321)),
     "square, off centre": ((300, 300), camera(390, 180, 120)),
     "pixels that are not square": ((640, 480), camera(533, 322, 236, fy=600)),
@@ -78,7 +78,7 @@ lenses = pytest.mark.parametrize("lens", LENSES)
 
 @lenses
 def test_what_a_camera_sees_falls_where_the_crops_intrinsics_say(lens):
-    """A dot is drawn where the stored picture's camera sees a point, and found in the crop by its centre of mass."""
+    """A dot is drawn where the stored image's camera sees a point, and found in the crop by its centre of mass."""
     (width, height), intrinsics = LENSES[lens]
     size = (height, width)
     preprocessing = CONTRACT.preprocessing_for(size, intrinsics)
@@ -129,7 +129,7 @@ def test_a_model_that_takes_pictures_does_it_by_itself(lens, echo, raw_echo):
     expected, said = (Localizer(each).localize(picture, intrinsics) for each in (echo, raw_echo))
     np.testing.assert_allclose(said.position_m, expected.position_m, rtol=1e-5)
     np.testing.assert_allclose(said.quaternion[1:], expected.quaternion[1:], rtol=1e-5)
-    assert said.quaternion[0] == pytest.approx(expected.quaternion[0], abs=1e-3)  # the picture's mean
+    assert said.quaternion[0] == pytest.approx(expected.quaternion[0], abs=1e-3)  # the image's mean
 
 
 def test_an_unknown_camera_is_taken_for_the_training_camera(echo, raw_echo):
@@ -154,7 +154,7 @@ def test_a_picture_that_is_too_narrow_needs_its_camera(echo, raw_echo):
     ids=["telescope", "centre elsewhere", "2x2", "NaN"],
 )
 def test_a_camera_that_cannot_be_is_refused(intrinsics, echo):
-    with pytest.raises(InputError, match="cannot be the camera of a picture of 640x480") as error:
+    with pytest.raises(InputError, match="cannot be the camera of an image of 640x480") as error:
         Localizer(echo).localize(np.zeros((480, 640, 3), np.uint8), intrinsics)
     assert "\n" not in str(error.value)
 

@@ -1,4 +1,4 @@
-"""Pictures as a camera stores them become those of a pinhole: against OpenCV, and against colours that name a ray."""
+"""Images as a camera stores them become those of a pinhole: against OpenCV, and against colours that name a ray."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def stored_picture(known, size):
 @lenses
 @pytest.mark.parametrize("size", [STORED, (160, 120), (640, 480), (427, 320)])
 def test_a_pixels_color_is_that_of_its_ray(known, size):
-    """Whole or resized, what comes out is a pinhole's picture with the matrix that comes with it."""
+    """Whole or resized, what comes out is a pinhole's image with the matrix that comes with it."""
     image, intrinsics = known.apply(stored_picture(known, size), "a")
     assert image.shape == (size[1], size[0], 3)
     columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
@@ -76,7 +76,7 @@ def test_what_is_left_is_cropped_to_its_middle(known):
 
 @lenses
 def test_pictures_are_those_of_opencv(known):
-    """Guess: OpenCV's own functions agree to a level on a smooth picture; they round places to 1/32 pixel."""
+    """Guess: OpenCV's own functions agree to a level on a smooth image; they round places to 1/32 pixel."""
     picture = stored_picture(known, STORED)
     lens, left = known.lens, matrix(known.leaves)
     if isinstance(lens, FisheyeModel):
@@ -151,7 +151,7 @@ def test_a_contract_names_the_function_and_what_it_leaves():
         (("lens", "focal_px"), [250]),
         (("lens", "focal_px"), [250, float("nan")]),
         (("leaves", "focal_px"), [275, 0]),
-        (("leaves", "focal_px"), [27.5, 26.9]),  # looks past the stored picture
+        (("leaves", "focal_px"), [27.5, 26.9]),  # looks past the stored image
         (("leaves", "centre_px"), [1e9, 0]),
         (("leaves", "width"), 321),  # larger than what is stored
         (("leaves", "height"), "x"),
@@ -174,7 +174,7 @@ def test_every_page_says_what_pictures_must_be(target, tmp_path):
     page = tmp_path / "INTEGRATION.md"
     write_pages(tmp_path, replace(CONTRACT, undistortion=FISHEYE), "7scenes", ["model.onnx"], target, None)
     said = page.read_text()
-    assert "Pictures must be without lens distortion" in said
+    assert "Images must be without lens distortion" in said
     assert "as 320x240, through a lens of OpenCV's fisheye model" in said
     assert "262.50 0 152.00, 0 257.25 123.00, 0 0 1" in said
     write_pages(tmp_path, CONTRACT, "7scenes", ["model.onnx"], target, None)
@@ -220,9 +220,9 @@ def test_a_network_is_given_the_undistorted_picture_and_its_camera():
             None,
             r"den.onnx: .* not known \(they are of 2",
         ),
-        (PINHOLE, (320, 180), None, "den.onnx: a picture of 320x180 has another shape than 320x240"),
-        (PINHOLE, (240, 320), None, "den.onnx: a picture of 240x320 has another shape than 320x240"),
-        (PINHOLE, STORED, np.eye(3), "intrinsics: of distorted pictures, the lens says them"),
+        (PINHOLE, (320, 180), None, "den.onnx: an image of 320x180 has another shape than 320x240"),
+        (PINHOLE, (240, 320), None, "den.onnx: an image of 240x320 has another shape than 320x240"),
+        (PINHOLE, STORED, np.eye(3), "intrinsics: of distorted images, the lens says them"),
     ],
 )
 def test_wrong_uses_are_told_in_one_line(undistortion, size, intrinsics, says):

@@ -113,7 +113,7 @@ def test_intrinsics_reach_the_network(server, bundles):
 
 def test_a_form_is_answered_in_order_and_a_bad_picture_spoils_no_other(server, frame):
     alone = ask(server[0], "/localize/den", frame.read_bytes())[1]
-    body, headers = form_of(frame.read_bytes(), b"no picture", frame.read_bytes())
+    body, headers = form_of(frame.read_bytes(), b"no image", frame.read_bytes())
     status, found = ask(server[0], "/localize/den", body, headers)
     first, second, third = found["pictures"]
     assert status == 200
@@ -127,12 +127,12 @@ def test_a_form_is_answered_in_order_and_a_bad_picture_spoils_no_other(server, f
         ("/localize/den", b"", {}, 422, "image cannot be decoded"),
         ("/localize/den", b"GIF89a and text", {}, 422, "image cannot be decoded"),
         ("/localize/den", "half", {}, 422, "image is truncated"),
-        ("/localize/den", bytes(2**20 + 1), {}, 413, "body: is larger than 1 MiB. Give smaller pictures, or fewer."),
-        ("/localize/den", "endless", {}, 413, "body: is larger than 1 MiB. Give smaller pictures, or fewer."),
+        ("/localize/den", bytes(2**20 + 1), {}, 413, "body: is larger than 1 MiB. Give smaller images, or fewer."),
+        ("/localize/den", "endless", {}, 413, "body: is larger than 1 MiB. Give smaller images, or fewer."),
         ("/localize/den", b"x", {"Content-Type": "multipart/form-data"}, 400, "body: is no form of at most 32 files"),
         ("/localize/den", *form_of(), 400, "body: the form holds no file"),
         ("/localize/den", *form_of(*[b"x"] * 33), 400, "Too many files"),
-        ("/localize/den?intrinsics=1,2", b"", {}, 400, "intrinsics: give FX,FY,CX,CY in pixels of the picture."),
+        ("/localize/den?intrinsics=1,2", b"", {}, 400, "intrinsics: give FX,FY,CX,CY in pixels of the image."),
         ("/localize/den?intrinsics=1,2,nan,4", b"", {}, 400, "intrinsics: give finite numbers."),
         ("/localize/lenses?intrinsics=1,1,1,1", "frame", {}, 422, "intrinsics"),
         ("/localize/cellar", b"", {}, 404, "bundle cellar: is not served. Choose one of den, lenses."),

@@ -261,7 +261,7 @@ def test_a_map_beside_the_networks_is_reported_once_and_both_with_every_seed(tmp
     assert float(row["from"]) < float(row["network and map, median rotation (°)"]) < float(row["to"])
     assert float(row["worst (m)"]) == pytest.approx(hard.max() / 10 + 0.02, abs=6e-3)
     assert (row["answered by the map"], row["of these wrong"]) == ("85.0%", "1.0%")
-    assert (row["CPU ms a picture"], row["map (MiB)"]) == ("16", "0.25")
+    assert (row["CPU ms an image"], row["map (MiB)"]) == ("16", "0.25")
     answers = [line[2:] for line in tables["references"][1:]]
     assert answers == [["map of 80 key frames, 240 px", "0.004", "0.100"]]  # once, whatever the network
     assert [line[0] for line in tables["results"][1:]] == ["a", "b"]

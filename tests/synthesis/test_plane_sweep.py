@@ -1,4 +1,4 @@
-"""Depth from pictures against the renderer's exact depth, and each step against loops or values by hand."""
+"""Depth from images against the renderer's exact depth, and each step against loops or values by hand."""
 
 import itertools
 

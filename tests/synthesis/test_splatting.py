@@ -1,4 +1,4 @@
-"""Views against pictures that the renderer takes at the same poses, and surfaces placed by hand."""
+"""Views against images that the renderer takes at the same poses, and surfaces placed by hand."""
 
 import numpy as np
 import pytest

@@ -53,7 +53,7 @@ def test_scenes_are_loaded_whole(scenes, cache, capsys, monkeypatch):
     print_scenes([found], "a machine")
     said = capsys.readouterr().out
     assert "of another size than the benchmark's: heads" in said
-    assert "rendered, no real pictures: heads" in said
+    assert "rendered, no real images: heads" in said
 
 
 def test_wrong_scenes(tmp_path):
@@ -69,6 +69,6 @@ def test_both_from_a_shell(scenes, cache, tool, capsys):
     """In processes of their own, which find what they run in the script; the tests above guard what is measured."""
     args = [str(SCRIPT), str(scenes), "heads", "--short-side", "36"]
     said = subprocess.run([sys.executable, *args], capture_output=True, text=True, check=True).stdout
-    assert "rendered, no real pictures: heads" in said
+    assert "rendered, no real images: heads" in said
     tool("benchmarks/loading", "--dataset", "7scenes", "--root", scenes)
     assert "ratio" in capsys.readouterr().out

@@ -36,7 +36,7 @@ def test_coefficients_and_shares_of_drawn_evidence(tmp_path):
     lines = calibrate([tmp_path]).splitlines()
     fitted = np.array(lines[0].split(": ")[1].split(), float)
     np.testing.assert_allclose(fitted, coefficients, atol=0.25)
-    assert lines[1].startswith("20000 frames, 20000 pictures")
+    assert lines[1].startswith("20000 frames, 20000 images")
     known = np.log(np.column_stack((rows[:, 4] + 0.5, rows[:, 5], rows[:, 6] + 0.1)))
     is_likely = coefficients[0] + known @ coefficients[1:] > np.log(0.95 / 0.05)
     accepted = is_likely & (rows[:, 5] <= MOST_DEVIATION)

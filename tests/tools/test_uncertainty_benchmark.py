@@ -101,7 +101,7 @@ def test_all_of_it_on_a_tiny_scene(systems, elsewhere, tmp_path, capsys):
     print_certainty(found, "a machine")
     said = capsys.readouterr().out
     assert "ensemble of 2" in said
-    assert "of 3 pictures of another place" in said
+    assert "of 3 images of another place" in said
 
 
 def test_one_checkpoint_and_no_other_place(systems, tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""The picture of a map's coverage: what it says to film next, by hand-made surveys, and that everything is drawn."""
+"""The image of a map's coverage: what it says to film next, by hand-made surveys, and that everything is drawn."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is drawn of a capture before it is written in a format, and how its texts and pictures are written."""
+"""What is drawn of a capture before it is written in a format, and how its texts and images are written."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Drawn:
         rng: for more draws.
         poses: true ``world_from_cam``, (N, 4, 4).
         marks: what a frame has instead of its pose: ``nan``, ``zeros`` or ``origin``; None of most.
-        sizes: (width, height) of each picture.
+        sizes: (width, height) of each image.
         encoding: of texts.
         newline: of texts.
-        truth: the true pose by the path of its picture, once written; None of frames without a fix.
-        pixels: of each picture, as it is stored.
+        truth: the true pose by the path of its image, once written; None of frames without a fix.
+        pixels: of each image, as it is stored.
     """
 
     folder: Path
@@ -43,7 +43,7 @@ class Drawn:
         path.write_bytes(content.replace("\n", self.newline).encode(self.encoding))
 
     def picture(self, row: int, name: str) -> None:
-        """Write a frame's picture, perhaps with an orientation tag, and keep what is true of it."""
+        """Write a frame's image, perhaps with an orientation tag, and keep what is true of it."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         width, height = self.sizes[row]
@@ -81,7 +81,7 @@ class Drawn:
         return line([*position, *(xyzw if order == "xyzw" else [xyzw[3], *xyzw[:3]])])
 
     def names(self) -> list[str]:
-        """Stems of pictures in order of time, of one kind: padded, unpadded, or with words around."""
+        """Stems of images in order of time, of one kind: padded, unpadded, or with words around."""
         style = str(self.rng.choice(["{:06d}", "{}", "frame_{}", "IMG {:03d}", "frame-{:06d}.color"]))
         first = int(self.rng.integers(0, 96))
         return [style.format(first + row) for row in range(len(self.poses))]

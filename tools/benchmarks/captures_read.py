@@ -40,7 +40,7 @@ def count_one(seed: int, folder: Path) -> tuple[str, Counter[str], str]:
 
 
 def _written(scene: Path) -> list[tuple[Path, np.ndarray]]:
-    """Each picture of a scene and its pose in the source's world, read by the standard library and SciPy."""
+    """Each image of a scene and its pose in the source's world, read by the standard library and SciPy."""
     offset = json.loads((scene / "scene.json").read_text()).get("world", {}).get("offset_m", (0, 0, 0))
     found = []
     with (scene / "frames.csv").open(newline="") as lines:
@@ -53,7 +53,7 @@ def _written(scene: Path) -> list[tuple[Path, np.ndarray]]:
 
 
 def _source_of(picture: Path, drawn: Drawn) -> Path | None:
-    """The picture that a written one was made of, by what it shows: names may have changed."""
+    """The image that a written one was made of, by what it shows: names may have changed."""
     shown = np.array(cv2.imread(str(picture), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), int)
     alike = {path: stored for path, stored in drawn.pixels.items() if stored.shape == shown.shape}
     off = {path: float(np.abs(stored - shown).mean()) for path, stored in alike.items()}

@@ -1,7 +1,7 @@
 """Captures in formats that the importer reads, written by NumPy and SciPy alone, with what is true of them.
 
 What is drawn with each: names and their order, clocks and their units, the encoding of texts, an origin as in UTM,
-frames without a fix, orientation tags, sizes of pictures. A pose means the pixels that a file stores.
+frames without a fix, orientation tags, sizes of images. A pose means the pixels that a file stores.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def clock(drawn: Drawn) -> tuple[list[str], list[str]]:
-    """Stems of pictures and words of poses: one recording's times, each in a unit of its own."""
+    """Stems of images and words of poses: one recording's times, each in a unit of its own."""
     start = Decimal(1403636579) if drawn.rng.random() < 0.8 else Decimal(5)
     units = list(PER_S) if start > 1000 else ["s"]
     step = Decimal(int(drawn.rng.integers(30, 150))) / 1000
@@ -37,7 +37,7 @@ def clock(drawn: Drawn) -> tuple[list[str], list[str]]:
 
 
 def tum(drawn: Drawn) -> None:
-    """A trajectory by time beside pictures that are named by theirs."""
+    """A trajectory by time beside images that are named by theirs."""
     stems, words = clock(drawn)
     lines = [f"{word} {drawn.words(row)}" for row, word in enumerate(words)]
     drawn.text(str(drawn.rng.choice(["trajectory.txt", "poses_est.txt", "run.tum"])), "\n".join(lines) + "\n")
@@ -56,7 +56,7 @@ def tum_rgbd(drawn: Drawn) -> None:
 
 
 def table_by_time(drawn: Drawn) -> None:
-    """A table without names of pictures."""
+    """A table without names of images."""
     stems, words = clock(drawn)
     rows = [[word, *drawn.words(row, "wxyz").split()] for row, word in enumerate(words)]
     _table(drawn, ["timestamp", "x", "y", "z", "qw", "qx", "qy", "qz"], rows)
@@ -192,7 +192,7 @@ def polycam(drawn: Drawn) -> None:
 
 
 def record3d(drawn: Drawn) -> None:
-    """A recording of Record3D, of one size or with smaller pictures."""
+    """A recording of Record3D, of one size or with smaller images."""
     rows = []
     for row in range(len(drawn.poses)):
         drawn.picture(row, f"rgbd/{row}.jpg")
@@ -207,7 +207,7 @@ def record3d(drawn: Drawn) -> None:
 
 
 def _lens(size: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point of pictures of a size, from their corner."""
+    """Focal lengths and principal point of images of a size, from their corner."""
     return 0.9 * size[0], 0.9 * size[0], size[0] / 2, size[1] / 2
 
 

@@ -109,7 +109,7 @@ def write_seven_scenes(folder: Path, count: int) -> None:
 
 
 def _write_pictures(folder: Path, names: list[str]) -> NDArray[np.float64]:
-    """Write a picture of soft noise for each name; returns poses (N, 4, 4) of a walk in circles, camera-to-world."""
+    """Write an image of soft noise for each name; returns poses (N, 4, 4) of a walk in circles, camera-to-world."""
     rng, angle = np.random.default_rng(0), np.linspace(0, len(names) / 100, len(names))
     for name in names:
         path = folder / name

@@ -3,7 +3,7 @@ calibrate the rule by which a map's pose is accepted.
 
 python tools/benchmarks/maps.py robustness RECIPE|SCENE [--checkpoint CHECKPOINT] [--frames N] [--width PX]
 python tools/benchmarks/maps.py colmap RECIPE|SCENE [--frames N] [--width PX]
-python tools/benchmarks/maps.py report FOLDER ... --out PICTURE
+python tools/benchmarks/maps.py report FOLDER ... --out IMAGE
 python tools/benchmarks/maps.py acceptance RECIPE|SCENE [--frames N] [--width PX] --out FOLDER
 python tools/benchmarks/maps.py calibrate FOLDER ...
 """
@@ -32,7 +32,7 @@ def main() -> None:
         command.add_argument("source", type=Path, metavar="RECIPE|SCENE", help="as tools/map.py takes it")
         command.add_argument("--frames", type=whole_number(2), help="key frames; the recipe's unless given")
         command.add_argument(
-            "--width", type=whole_number(32), help="of the pictures in which keypoints are searched, in pixels"
+            "--width", type=whole_number(32), help="of the images in which keypoints are searched, in pixels"
         )
         command.add_argument("--seeds", type=whole_number(0), nargs="+", help="of RANSAC; the recipe's unless given")
         command.add_argument("--out", type=Path, help="folder to write to")
@@ -46,7 +46,7 @@ def main() -> None:
     robustness.add_argument("--unit", default="m", help="of the scene's positions, for the figure")
     report.add_argument("folders", nargs="+", type=Path, help="that robustness wrote")
     calibration.add_argument("folders", nargs="+", type=Path, help="that acceptance wrote")
-    report.add_argument("--out", type=Path, required=True, help="picture to draw, a PNG")
+    report.add_argument("--out", type=Path, required=True, help="image to draw, a PNG")
     args = parser.parse_args()
     if args.command == "report":
         results = read_results(args.folders)

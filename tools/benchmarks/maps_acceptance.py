@@ -95,7 +95,7 @@ def _centered(matrix: Floats, scale: float) -> Floats:
 
 
 def _pictures(rgb: Image, rng: np.random.Generator) -> list[tuple[int, Image, float]]:
-    """Number of each disturbance, the picture, and by what its focal length is stated wrongly."""
+    """Number of each disturbance, the image, and by what its focal length is stated wrongly."""
     fixed = [(number, disturb(rgb, rng), 1.0) for number, disturb in enumerate(DISTURBANCES.values())]
     drawn = [(_NAMES.index(_RANDOM), _drawn(rgb, rng), 1.0) for _ in range(_DRAWN)]
     return [*fixed, *drawn, (len(_NAMES) - 2, rgb, 0.9), (len(_NAMES) - 1, rgb, 1.1)]
@@ -145,7 +145,7 @@ def calibrate(folders: Sequence[Path]) -> str:
     fit = _fit(known[says & is_asked], is_wrong[says & is_asked])
     lines = [
         "constant, log(cells + 0.5), log(deviation), log(turn + 0.1): " + " ".join(f"{each:.2f}" for each in fit),
-        f"{len(np.unique(pictures[:, :2], axis=0))} frames, {len(np.unique(pictures[is_asked], axis=0))} pictures with "
+        f"{len(np.unique(pictures[:, :2], axis=0))} frames, {len(np.unique(pictures[is_asked], axis=0))} images with "
         f"a pose, {int(is_asked.sum())} poses",
     ]
     has_matches = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
@@ -206,7 +206,7 @@ def _read(folders: Sequence[Path]) -> tuple[dict[str, Floats], NDArray[np.int64]
 
 
 def _likeliest(pictures: Floats, probability: Floats) -> NDArray[np.bool_]:
-    """Which pose of each picture, a row of keys, is the answer."""
+    """Which pose of each image, a row of keys, is the answer."""
     _, number = np.unique(pictures, axis=0, return_inverse=True)
     order = np.lexsort((-probability, number.ravel()))
     is_first = np.diff(number.ravel()[order], prepend=-1) > 0

@@ -1,4 +1,4 @@
-"""Our map beside pycolmap's own route: the same key frames, the same pictures, in turns."""
+"""Our map beside pycolmap's own route: the same key frames, the same images, in turns."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Turn:
 
     Args:
         scores: of each query: errors in metres and degrees, whether accepted, CPU seconds.
-        build_cpu_s: CPU seconds of the process, on all threads, to build from the pictures.
+        build_cpu_s: CPU seconds of the process, on all threads, to build from the images.
         bytes: that must be shipped.
         points: triangulated.
     """

@@ -100,7 +100,7 @@ class ColmapRoute:
         return self.colmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
 
     def find_features(self, pictures: Pictures) -> None:
-        """Find SIFT of pictures, with COLMAP's defaults, on one thread."""
+        """Find SIFT of images, with COLMAP's defaults, on one thread."""
         colmap, mode = self.colmap, self.colmap.CameraMode.SINGLE
         reader = colmap.ImageReaderOptions(camera_model="PINHOLE")
         reader.camera_params = ",".join(map(str, self.camera(1).params))
@@ -110,7 +110,7 @@ class ColmapRoute:
         colmap.extract_features(self.database, pictures.folder, pictures.names, mode, reader, options)
 
     def match(self, pairs: Sequence[tuple[str, str]], is_verified: bool) -> None:
-        """Match pairs of pictures."""
+        """Match pairs of images."""
         listed = self.work / "pairs.txt"
         listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
         matching = self.colmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)

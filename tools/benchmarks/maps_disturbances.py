@@ -1,4 +1,4 @@
-"""Pictures made worse: motion blur, darkness, things in front, a smaller sensor."""
+"""Images made worse: motion blur, darkness, things in front, a smaller sensor."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mambaloc.images import Image
 
 Disturbance = Callable[[Image, np.random.Generator], Image]
 
-_BLUR_WIDTH_PX = 640  # of the picture in which lengths of motion blur are given
-_NOISE = 3.0  # standard deviation of a dark picture's noise, of 255
-_SIDES = (0.2, 0.45)  # of rectangles in front, over the picture's
+_BLUR_WIDTH_PX = 640  # of the image in which lengths of motion blur are given
+_NOISE = 3.0  # standard deviation of a dark image's noise, of 255
+_SIDES = (0.2, 0.45)  # of rectangles in front, over the image's
 _TEXTURE_PX = 8  # sides of the squares of a textured rectangle
 
 
 def undisturbed(image: Image, rng: np.random.Generator) -> Image:
-    """The picture as it is stored."""
+    """The image as it is stored."""
     return image
 
 
@@ -29,7 +29,7 @@ def motion_blur(image: Image, rng: np.random.Generator, length_px: float) -> Ima
     Args:
         image: RGB (H, W, 3).
         rng: draws the direction.
-        length_px: of the line, in pixels of a picture that is 640 wide.
+        length_px: of the line, in pixels of an image that is 640 wide.
     """
     length_px = length_px * image.shape[1] / _BLUR_WIDTH_PX
     kernel = _line(max(length_px, 1.0), rng.uniform(0, np.pi))

@@ -138,7 +138,7 @@ def _verdict(both_less: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
 
 
 def overview(results: Sequence[Mapping[str, Any]]) -> str:
-    """Errors on undisturbed pictures, and what each way costs: a table in Markdown, a row a scene and way."""
+    """Errors on undisturbed images, and what each way costs: a table in Markdown, a row a scene and way."""
     far = f"over {FAR_M} m or {FAR_DEG:.0f}° off"
     lines = [f"| | | median | mean | {far} | a query | size | preparation |", "|---" * 8 + "|"]
     for result in results:
@@ -198,7 +198,7 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw medians above and tails below, a column a scene, a line a disturbance.
 
     Raises:
-        InputError: where the picture cannot be written.
+        InputError: where the image cannot be written.
     """
     figure = Figure(figsize=(2.2 + 2.5 * len(results), 6.8), layout="constrained")
     grid = figure.subplots(2, len(results), squeeze=False, sharey=True)

@@ -1,4 +1,4 @@
-"""A network, a sparse map, and both together on the same pictures, undisturbed and disturbed."""
+"""A network, a sparse map, and both together on the same images, undisturbed and disturbed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Answers:
         position_m: errors.
         rotation_deg: errors.
         is_accepted: whether the pose is the map's, and its rule accepts it.
-        cpu_s: CPU time of this process on all threads, without decoding the picture.
+        cpu_s: CPU time of this process on all threads, without decoding the image.
     """
 
     position_m: Floats

@@ -117,7 +117,7 @@ def print_scenes(scenes: Sequence[SceneCost], machine: str) -> None:
     for said, which in {
         "of the benchmark's size": [each.scene for each in scenes if each.counts == each.official],
         "of another size than the benchmark's": [each.scene for each in scenes if each.counts != each.official],
-        "rendered, no real pictures": [each.scene for each in scenes if each.rendered],
+        "rendered, no real images": [each.scene for each in scenes if each.rendered],
         "with bad frames": [f"{each.scene} ({each.skipped})" for each in scenes if each.skipped],
     }.items():
         if which:

@@ -1,6 +1,6 @@
 """Load a server of poses with hey, and compare it with a plain loop over Localizer.localize in the same run.
 
-python tools/benchmarks/serving.py BUNDLE PICTURE [--requests 100000] [--kills 20]
+python tools/benchmarks/serving.py BUNDLE IMAGE [--requests 100000] [--kills 20]
 
 Then so many requests from 16 clients, during which worker processes are killed: what was lost, and the memory.
 hey is a load generator: github.com/rakyll/hey, or Debian's package of that name.
@@ -84,7 +84,7 @@ def main() -> None:
 
 
 def loop_per_second(bundle: Path, picture: Path, threads: int | None) -> float:
-    """Pictures that a loop decodes and localizes in a second."""
+    """Images that a loop decodes and localizes in a second."""
     localizer, data = Localizer(bundle, threads), picture.read_bytes()
     counts: list[float] = []
     began = time.perf_counter()
@@ -100,7 +100,7 @@ def loop_per_second(bundle: Path, picture: Path, threads: int | None) -> float:
 
 @contextmanager
 def served(bundle: Path, workers: int) -> Iterator[tuple[int, str]]:
-    """A server of a bundle, once it answers, and the address to send pictures to."""
+    """A server of a bundle, once it answers, and the address to send images to."""
     command = [sys.executable, "-c", _SERVE, str(bundle), "--port", "0", "--workers", str(workers)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -124,7 +124,7 @@ def _is_up(url: str) -> bool:
 
 
 def under_load(url: str, picture: Path, clients: int, seconds: float = 0, requests: int = 0) -> Load:
-    """Send a picture again and again, for so long or so often."""
+    """Send an image again and again, for so long or so often."""
     amount = ["-n", str(requests // clients * clients)] if requests else ["-z", f"{seconds}s"]
     command = ["hey", *amount, "-c", str(clients), "-m", "POST", "-D", str(picture), "-t", "60", "-o", "csv", url]
     began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""COLMAP's incremental and global mappers on rendered films, and where an import spends its time.
+"""COLMAP's incremental and global mappers on rendered videos, and where an import spends its time.
 
 python tools/benchmarks/structure.py [--seeds 5 6 7] [--frames 72]
 """
@@ -21,19 +21,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mambaloc.console import OptionParser, exits_cleanly, whole_number
-from mambaloc.importing.film import write_frames
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.sfm.process import Job
 from mambaloc.importing.sfm.reconstruction import find_features, match_features
 from mambaloc.importing.sfm.structure import read_structure
+from mambaloc.importing.video import write_frames
 from mambaloc.rendering import default_intrinsics, furnished_room, render, smooth_trajectory
 from mambaloc.runtime.sources import frames_of
 
 Floats = NDArray[np.floating[Any]]
 
 _SIZE = (320, 240)
-_NEIGHBOURS = 10  # of a film's frame that it is matched with, as the import has them
+_NEIGHBOURS = 10  # of a video's frame that it is matched with, as the import has them
 _INSIDE_M = ((-1.25, -1.0, 1.1), (1.25, 1.0, 1.7))
 
 
@@ -41,8 +41,8 @@ _INSIDE_M = ((-1.25, -1.0, 1.1), (1.25, 1.0, 1.7))
 def main() -> None:
     """Print CPU seconds of each step, and the errors of both mappers."""
     parser = OptionParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=whole_number(0), nargs="+", default=[5, 6, 7], help="a film each")
-    parser.add_argument("--frames", type=whole_number(24), default=72, help="of a film")
+    parser.add_argument("--seeds", type=whole_number(0), nargs="+", default=[5, 6, 7], help="a video each")
+    parser.add_argument("--frames", type=whole_number(24), default=72, help="of a video")
     args = parser.parse_args()
     for seed in args.seeds:
         with TemporaryDirectory() as work:

@@ -19,7 +19,7 @@ def main() -> None:
     quieten()
     parser = OptionParser(description=__doc__)
     parser.add_argument("checkpoints", nargs="+", help="of one scene; several are also taken for an ensemble")
-    parser.add_argument("--elsewhere", type=Path, help="folder of pictures of another place")
+    parser.add_argument("--elsewhere", type=Path, help="folder of images of another place")
     parser.add_argument("--out", type=Path, default=Path("runs/uncertainty"), help="folder of the plot and the figures")
     args = parser.parse_args()
     systems = {checkpoint: load_with_scene(checkpoint) for checkpoint in args.checkpoints}

@@ -19,7 +19,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.data.augmentation import center_crop
 from mambaloc.errors import InputError
 from mambaloc.geometry import canonical, cropped_intrinsics, position_error_m, rotate, rotation_error_deg
-from mambaloc.images import PICTURES, pictures, read_image
+from mambaloc.images import IMAGE_SUFFIXES, list_images, read_image
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork
 from mambaloc.types import PosePrediction
@@ -53,7 +53,7 @@ class Way:
     """A way of telling how sure a pose is: larger scores for what should be wrong by more.
 
     Shape:
-        ``position`` and ``rotation`` (N,) over the test frames, ``elsewhere`` (M,) over pictures of another place, none
+        ``position`` and ``rotation`` (N,) over the test frames, ``elsewhere`` (M,) over images of another place, none
         where none were given.
 
     Args:
@@ -80,7 +80,7 @@ class Certainty:
         coverage: shares of test frames within both radii, for each of :data:`LEVELS`.
         radii: medians of both radii over the test frames, likewise.
         unfamiliarity: of the test frames, (N,).
-        unfamiliarity_elsewhere: of pictures of another place, (M,); none where none were given.
+        unfamiliarity_elsewhere: of images of another place, (M,); none where none were given.
         ways: of telling; the first is the exported one.
     """
 
@@ -104,10 +104,10 @@ def measure_certainty(
     Args:
         systems: by name, each with the data that it was trained with, all of one scene; several are also taken for an
             ensemble.
-        elsewhere: folder of pictures of another place.
+        elsewhere: folder of images of another place.
 
     Raises:
-        InputError: for too few frames held out, or pictures that cannot be read.
+        InputError: for too few frames held out, or images that cannot be read.
     """
     networks = [copy.deepcopy(system.network).cpu().float().eval() for system, _ in systems.values()]
     found = []
@@ -168,7 +168,7 @@ def median_of_surest(score: Tensor, error: Tensor, share: float) -> Tensor:
 
 
 def told_apart(score: Tensor, elsewhere: Tensor) -> float:
-    """Area under the ROC curve: the chance that a picture of another place scores higher than a test frame."""
+    """Area under the ROC curve: the chance that an image of another place scores higher than a test frame."""
     of_elsewhere = torch.cat((torch.zeros(len(score)), torch.ones(len(elsewhere))))
     ranks = (
         torch.cat((score, elsewhere)).unique(return_inverse=True)[1].double()
@@ -272,10 +272,10 @@ def _test_frames(data: PoseDataModule) -> Pictures:
 
 
 def _pictures_of(folder: Path, data: PoseDataModule) -> Pictures:
-    """Pictures of another place, their middle cut to the shape of the scene's frames."""
-    paths = pictures(folder)
+    """Images of another place, their middle cut to the shape of the scene's frames."""
+    paths = list_images(folder)
     if not paths:
-        raise InputError(f"--elsewhere {folder}: holds no {', '.join(PICTURES)}; give a folder of pictures")
+        raise InputError(f"--elsewhere {folder}: holds no {', '.join(IMAGE_SUFFIXES)}; give a folder of images")
     height, width = next(_test_frames(data)())[0].shape[-2:]
 
     def read() -> Iterator[Frames]:

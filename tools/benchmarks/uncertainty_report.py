@@ -57,7 +57,7 @@ def print_certainty(found: Sequence[Certainty], machine: str) -> None:
     flagged = f"unfamiliar: {np.mean([_flagged(each.unfamiliarity) for each in found]):.1%} of the test frames"
     if pictures := len(first.unfamiliarity_elsewhere):
         there = np.mean([_flagged(each.unfamiliarity_elsewhere) for each in found])
-        flagged += f", {there:.1%} of {pictures} pictures of another place"
+        flagged += f", {there:.1%} of {pictures} images of another place"
     console.print(flagged, soft_wrap=True)
     counts = f"{len(first.position_error_m)} test frames, {first.held_out_frames} held out of training to calibrate on"
     console.print(f"{found[0].where}; {counts}; means over {len(found)} checkpoint(s); {machine}", soft_wrap=True)
@@ -66,7 +66,7 @@ def print_certainty(found: Sequence[Certainty], machine: str) -> None:
 def compared(found: Sequence[Certainty]) -> dict[str, dict[str, Any]]:
     """Figures of each way, means over the checkpoints: how scores rank errors, what rejecting the least sure is worth.
 
-    ``told_apart`` is None where there were no pictures of another place.
+    ``told_apart`` is None where there were no images of another place.
     """
     figures = {}
     for number, way in enumerate(found[0].ways):
@@ -147,7 +147,7 @@ def _draw_familiarity(axes: Axes, found: Sequence[Certainty]) -> None:
             values, bins.tolist(), weights=np.full(len(values), 1 / len(values)), color=color, alpha=0.65, label=name
         )
     axes.axvline(1, color="#374151", linewidth=1, linestyle="--")
-    axes.set(xlabel="unfamiliarity (flagged right of the dashed line)", ylabel="share of pictures")
+    axes.set(xlabel="unfamiliarity (flagged right of the dashed line)", ylabel="share of images")
     axes.legend(frameon=False, loc="upper left")
 
 
@@ -189,5 +189,5 @@ def _error(each: Certainty, of: str) -> Tensor:
 
 
 def _flagged(unfamiliarity: Tensor) -> float | None:
-    """Share over 1; None of no pictures."""
+    """Share over 1; None of no images."""
     return (unfamiliarity > 1).double().mean().item() if len(unfamiliarity) else None

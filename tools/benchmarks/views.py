@@ -1,4 +1,4 @@
-"""Measure view synthesis on the training frames of a scene in the layout of 7-Scenes, on one core: depth from pictures
+"""Measure view synthesis on the training frames of a scene in the layout of 7-Scenes, on one core: depth from images
 against the sensor's, views at the poses of held-out frames, and views a second.
 
 The rate counts CPU time, from opening the frames to files on disk. Give --out a new folder: views are made only once.
@@ -47,7 +47,7 @@ def main() -> None:
     parser = OptionParser(description=__doc__)
     parser.add_argument("--root", default="../shared/data/7scenes_blocks")
     parser.add_argument("--scene", default="redkitchen")
-    parser.add_argument("--short_side", type=int, default=108, help="of the pictures and the views, in pixels")
+    parser.add_argument("--short_side", type=int, default=108, help="of the images and the views, in pixels")
     parser.add_argument("--map", type=Path, help="of the training frames, whose adjusted poses and lens are used")
     parser.add_argument("--out", type=Path, default=Path("runs/views"))
     args = parser.parse_args()
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def adjusted(frames: PosedFrames, sparse_map: SparseMap) -> PosedFrames:
-    """Frames with the poses and the focal length of a map, as its pictures have them."""
+    """Frames with the poses and the focal length of a map, as its images have them."""
     drift = MapLocalizer(sparse_map).drift
     poses = [drift.to_adjusted(CameraPose(pose[:3, :3], pose[:3, 3])).matrix for pose in frames.world_from_cam]
     scale = np.array([[sparse_map.lens.focal, 1, 1], [1, sparse_map.lens.focal, 1], [1, 1, 1]])

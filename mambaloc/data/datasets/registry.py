@@ -80,7 +80,7 @@ def how_to_get(dataset: str, scene: str, root: Path) -> str:
 
 
 def is_rendered(folder: Path) -> bool:
-    """Whether a scene's ``scene.json`` says that it was rendered: no benchmark's pictures, whatever its poses."""
+    """Whether a scene's ``scene.json`` says that it was rendered: no benchmark's images, whatever its poses."""
     return "rendered_by" in capture.scene_note(folder)
 
 

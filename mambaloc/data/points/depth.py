@@ -52,7 +52,7 @@ def read_depth_points(folder: Path, frames: Frames, cameras: Cameras, count: int
     Args:
         folder: the scene's.
         frames: the frames asked for, of which one at least has depth.
-        cameras: of their pictures.
+        cameras: of their images.
         count: points a frame, P.
         seed: of the draw.
 
@@ -151,7 +151,7 @@ def _lenders(frames: Frames, rows: list[int]) -> dict[int, NDArray[np.int64]]:
 
 
 def _in_view(points_m: Points, frames: Frames, cameras: Cameras, row: int) -> Points:
-    """Those of the points that lie in front of a frame's camera and project into its picture."""
+    """Those of the points that lie in front of a frame's camera and project into its image."""
     cam_from_world = _pose(frames, row).inverse()
     points_cam = transform(cam_from_world, torch.from_numpy(points_m))
     pixels = project(points_cam, torch.from_numpy(cameras.intrinsics[row])).numpy()

@@ -1,4 +1,4 @@
-"""Depth of training frames, from a sensor or from the pictures: what views are made from.
+"""Depth of training frames, from a sensor or from the images: what views are made from.
 
 Only frames that are trained on lend their depth: none of those held out, thinned away or tested on.
 """
@@ -33,7 +33,7 @@ _MOST_FRAMES = 400  # with depth, spread over the poses; more cost time and add 
 _ENOUGH_FRAMES = 20  # with depth; where there are fewer than twice as many frames, half of them
 _FAR_OFF = 30.0  # times: no place of one scene, but another unit
 _NAMED = 3  # files in a line
-_SEARCHED = "Depth is searched in the pictures."
+_SEARCHED = "Depth is searched in the images."
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ def depth_of_frames(folder: Path, data: CachedFrames, how: ViewDepth, device: to
     Args:
         folder: the scene's.
         data: the training frames.
-        how: ``auto`` takes a sensor's where enough frames have some that fits the poses, else the pictures'.
-        device: that searches depth in pictures.
+        how: ``auto`` takes a sensor's where enough frames have some that fits the poses, else the images'.
+        device: that searches depth in images.
 
     Raises:
         InputError: where there is none that fits the poses.
@@ -99,7 +99,7 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
         InputError: where no depth can be used, or most of it disagrees with the poses.
     """
     if not rows:
-        raise InputError(f"{folder}: no training frame has depth. Set data.view_depth to pictures.")
+        raise InputError(f"{folder}: no training frame has depth. Set data.view_depth to images.")
     poses = poses_of(data.frames.select(np.array(rows)))
     chosen = np.array(rows)[farthest_points(viewpoints(poses, spread_m(poses)), _MOST_FRAMES, first=0)]
     files = [depth_path(data.frames.image_paths[row]) for row in chosen]
@@ -108,7 +108,7 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
     rules = {file: each for file, each in zip(files, read, strict=True) if isinstance(each, str)}
     if len(rules) == len(files):
         line = f"{files[0]}: depth {rules[files[0]]}, and no other depth frame can be used."
-        raise InputError(f"{line} Mend them, or set data.view_depth to pictures.")
+        raise InputError(f"{line} Mend them, or set data.view_depth to images.")
     known = {file: each for file, each in zip(files, read, strict=True) if not isinstance(each, str)}
     rules |= of_another_unit(known)
     kept = [row for row, file in enumerate(files) if file not in rules]
@@ -121,7 +121,7 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
 def read_all(
     folder: Path, files: list[Path], intrinsics: Floats, size: tuple[int, int]
 ) -> list[NDArray[np.float32] | str]:
-    """Depth frames carried into their pictures, of one size (height, width); or the rule that one breaks.
+    """Depth frames carried into their images, of one size (height, width); or the rule that one breaks.
 
     Raises:
         InputError: for bad intrinsics of the sensor.
@@ -140,7 +140,7 @@ def read_all(
         if is_unknown.all():
             return "has no measured pixel"
         depth_m = carried_depth(np.where(is_unknown, np.nan, depth_mm / 1000), sensor, matrix, size)
-        return depth_m if np.isfinite(depth_m).any() else "has no measured pixel in the picture"
+        return depth_m if np.isfinite(depth_m).any() else "has no measured pixel in the image"
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(read, files, intrinsics))

@@ -82,7 +82,7 @@ class SceneViews:
     def summary(self) -> str:
         """How many views there are, from what, and how good they are, in one line."""
         count = 0 if self.views is None else len(self.views)
-        made_of = {"sensor": "depth frames", "pictures": "frames, whose depth was searched in the pictures"}
+        made_of = {"sensor": "depth frames", "pictures": "frames, whose depth was searched in the images"}
         return (
             f"{count} views of {len(self.source)} {made_of[self.kind]}; {self.quality.describe()}; "
             f"made in {self.seconds:.0f} s"

@@ -45,11 +45,11 @@ class FramesAndViews(CachedFrames):
 
     @property
     def nbytes(self) -> int:
-        """Of all pictures."""
+        """Of all images."""
         return self.images.nbytes + self.views.images.nbytes
 
     def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Pictures of some rows, frames' and views', (B, 3, H, W)."""
+        """Images of some rows, frames' and views', (B, 3, H, W)."""
         count = len(self.frames)
         pictures = np.stack([self.images[row] if row < count else self.views.images[row - count] for row in rows])
         release_pages(self.images)

@@ -54,7 +54,7 @@ def points_of_frames_by_depth(
 def _lifted(
     depth_m: Floats, intrinsics: Floats, world_from_cam: Floats, count: int, rng: np.random.Generator
 ) -> Points:
-    """World points (K, 3) of pixels drawn from those of a picture (H, W) that have a depth."""
+    """World points (K, 3) of pixels drawn from those of an image (H, W) that have a depth."""
     known = np.flatnonzero(np.isfinite(depth_m))
     drawn = rng.choice(known, min(count, len(known)), replace=False, shuffle=False)
     y, x = np.divmod(drawn, depth_m.shape[1])

@@ -38,7 +38,7 @@ function inWords(map, file) {
   if (!map) return "";
   const focal = (map.intrinsics[0][0] / map.size[0]).toFixed(2);
   return (
-    `${map.points} points of ${map.key_frames} key frames, ${(file.bytes / 1e6).toFixed(1)} MB. Pictures are taken ` +
+    `${map.points} points of ${map.key_frames} key frames, ${(file.bytes / 1e6).toFixed(1)} MB. Images are taken ` +
     `to be of its camera, without distortion, focal length ${focal} of the width`
   );
 }

@@ -25,7 +25,7 @@ export function probabilityOf(cells, deviation, turn_deg) {
 
 /**
  * How many cells of the grid hold a place or more.
- * @param {{x: number, y: number}[]} places in shares of the picture.
+ * @param {{x: number, y: number}[]} places in shares of the image.
  */
 export function occupiedCells(places) {
   return new Set(places.map(({ x, y }) => CELLS * Math.floor(CELLS * y) + Math.floor(CELLS * x))).size;

@@ -33,7 +33,7 @@ async function main() {
   openView(sequences);
   readout = new Readout(view?.up ?? null);
   if (description && Film.plays(description.file)) film = new Film(description);
-  $("film-note").textContent = film?.poses ? "A film whose true poses are known." : "";
+  $("film-note").textContent = film?.poses ? "A video whose true poses are known." : "";
   $("offer-film").hidden = !film;
   document.querySelector(".key .path").hidden = !Object.keys(sequences).length;
   listen();
@@ -80,7 +80,7 @@ function listen() {
   $("play").addEventListener("click", () => ($("video").paused ? $("video").play() : $("video").pause()));
   for (const event of ["play", "pause"]) $("video").addEventListener(event, showPlaying);
   $("video").addEventListener("error", ({ target }) => {
-    if (target.hasAttribute("src")) fail(new Error("This browser cannot play the film: choose another source."));
+    if (target.hasAttribute("src")) fail(new Error("This browser cannot play the video: choose another source."));
   });
   $("check").addEventListener("click", async ({ target }) => {
     target.disabled = true;
@@ -223,9 +223,9 @@ function startStream(frameAt = null) {
 }
 
 /**
- * Localize one picture and show where it was taken; null if another source was chosen meanwhile.
+ * Localize one image and show where it was taken; null if another source was chosen meanwhile.
  * @param truth pose, where that is known.
- * @param {number[][]|null} intrinsics of the picture; the training camera's unless given.
+ * @param {number[][]|null} intrinsics of the image; the training camera's unless given.
  */
 async function localize(bitmap, truth = null, intrinsics = null) {
   const turn = visit;
@@ -245,7 +245,7 @@ async function localize(bitmap, truth = null, intrinsics = null) {
   return pose;
 }
 
-/** Localize a picture that does not move. */
+/** Localize an image that does not move. */
 async function localizeStill(blob, name, frame = null) {
   const turn = visit;
   try {

@@ -1,5 +1,5 @@
 /**
- * Carries poses between a map's frame, which was adjusted to the pictures, and that of the poses it was given, as
+ * Carries poses between a map's frame, which was adjusted to the images, and that of the poses it was given, as
  * `mambaloc/runtime/maps/drift.py` does. No DOM.
  */
 
@@ -20,7 +20,7 @@ export class Drift {
   #nugget;
 
   /**
-   * @param {object[]} keyPoses adjusted to the pictures.
+   * @param {object[]} keyPoses adjusted to the images.
    * @param {number[][]} weights six of each: of the shift in metres and the turn in radians along the camera's axes.
    * @param {number} nugget with which they were fitted.
    */

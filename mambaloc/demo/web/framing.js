@@ -1,5 +1,5 @@
 /**
- * How a picture of any camera becomes what the network is fed, as `mambaloc/runtime/contract.py` has it. No DOM.
+ * How an image of any camera becomes what the network is fed, as `mambaloc/runtime/contract.py` has it. No DOM.
  */
 
 import { checkHoldsCrop, resizedSize, roundHalfToEven } from "./pictures.js";
@@ -8,13 +8,13 @@ const MOST_ENLARGED = 4;
 const FULL_FRAME_MM = Math.hypot(36, 24);
 
 /**
- * The picture's resizing, and its camera as the model is fed it.
+ * The image's resizing, and its camera as the model is fed it.
  * @param {{width: number, height: number}} image
  * @param {object} contract of a bundle.
- * @param {number[][]|null} intrinsics pinhole matrix in the picture's pixels; the training camera's unless given.
+ * @param {number[][]|null} intrinsics pinhole matrix in the image's pixels; the training camera's unless given.
  * @returns {{preprocessing: object, camera: number[][]|null}} `camera` is null for a model that takes none.
  *
- * Throws where the camera is unknown, and the model's crop does not fit into the picture.
+ * Throws where the camera is unknown, and the model's crop does not fit into the image.
  */
 export function framing(image, contract, intrinsics = null) {
   const { preprocessing: usual, intrinsics: trained = null } = contract;
@@ -27,7 +27,7 @@ export function framing(image, contract, intrinsics = null) {
 }
 
 /**
- * The pinhole matrix of a lens whose axis meets the picture in its middle.
+ * The pinhole matrix of a lens whose axis meets the image in its middle.
  * @param {{width: number, height: number}} image
  * @param {number} focalMm focal length of the lens that sees as much across the diagonal of 35 mm film.
  */
@@ -42,19 +42,19 @@ function shortSide({ width, height }, { short_side }, focalRatio) {
   return Math.min(Math.max(asLarge, 1), MOST_ENLARGED * short_side);
 }
 
-/** From a picture's camera to its crop's. */
+/** From an image's camera to its crop's. */
 function cropCamera(image, preprocessing, [[fx, , cx], [, fy, cy]]) {
   const [x, y] = cropAxes(image, preprocessing);
   return pinhole(x.scale * fx, y.scale * fy, x.scale * cx + x.shift, y.scale * cy + y.shift);
 }
 
-/** From a crop's camera to its picture's. */
+/** From a crop's camera to its image's. */
 function imageCamera(image, preprocessing, [[fx, , cx], [, fy, cy]]) {
   const [x, y] = cropAxes(image, preprocessing);
   return pinhole(fx / x.scale, fy / y.scale, (cx - x.shift) / x.scale, (cy - y.shift) / y.scale);
 }
 
-/** A picture's columns and rows become `scale` times that plus `shift` in the crop. */
+/** An image's columns and rows become `scale` times that plus `shift` in the crop. */
 function cropAxes({ width, height }, { short_side, crop }) {
   const [newHeight, newWidth] = resizedSize({ width, height }, short_side);
   const axes = [

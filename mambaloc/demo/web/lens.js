@@ -1,22 +1,22 @@
-/** What lens took a picture, if the page is told, and what part of the picture the model sees. */
+/** What lens took an image, if the page is told, and what part of the image the model sees. */
 
 import { cameraOfLens, framing } from "./framing.js";
 
 const $ = (id) => document.getElementById(id);
 
-/** Ask for the lens of pictures that any camera may have taken, where the answer depends on it. */
+/** Ask for the lens of images that any camera may have taken, where the answer depends on it. */
 export function askForLens(source, dependsOnIt) {
   $("lens").hidden = !dependsOnIt || !isOfAnyCamera(source);
 }
 
-/** The camera of a picture by the lens that was stated; null: take it for the training camera's. */
+/** The camera of an image by the lens that was stated; null: take it for the training camera's. */
 export function statedCamera(source, image) {
   const { valueAsNumber: focalMm, validity } = $("focal");
   return isOfAnyCamera(source) && validity.valid && focalMm ? cameraOfLens(image, focalMm) : null;
 }
 
 /**
- * Outline the part of the picture that the model sees.
+ * Outline the part of the image that the model sees.
  *
  * Throws as {@link framing}.
  */

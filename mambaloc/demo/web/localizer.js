@@ -1,5 +1,5 @@
 /**
- * Poses from pictures with an exported network, and a sparse map beside it where the bundle has one. No DOM: the same
+ * Poses from images with an exported network, and a sparse map beside it where the bundle has one. No DOM: the same
  * file runs in a browser's worker and in Node.
  */
 
@@ -36,7 +36,7 @@ export class Localizer {
   }
 
   /**
-   * Localize one picture: the map's pose where it is accepted or likelier to be right than the network's, which is the
+   * Localize one image: the map's pose where it is accepted or likelier to be right than the network's, which is the
    * answer otherwise.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the training camera's unless given.

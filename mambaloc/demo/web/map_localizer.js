@@ -1,4 +1,4 @@
-/** Where a picture was taken, from a sparse map, as `mambaloc/runtime/maps/localizer.py` finds it. No DOM. */
+/** Where an image was taken, from a sparse map, as `mambaloc/runtime/maps/localizer.py` finds it. No DOM. */
 
 import { focalScale, project, ransacPose, refinePose, residuals, selected } from "./absolute_pose.js";
 import { LEAST_PROBABILITY, MOST_DEVIATION, isAnotherFocalLength, occupiedCells, probabilityOf } from "./acceptance.js";
@@ -22,7 +22,7 @@ const SHARED = 1.25; // of variances: neighbouring matches share errors
 const LENS_STEPS = 10;
 const SAME = 0.01; // of the width, by which a camera may differ from the map's and still be its own
 
-/** Localizes pictures in a map. */
+/** Localizes images in a map. */
 export class MapLocalizer {
   #map;
   #seed;
@@ -47,13 +47,13 @@ export class MapLocalizer {
   }
 
   /**
-   * Localize one picture.
+   * Localize one image.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels; the map's camera unless given.
    * @param prior a pose to search around where all points at once find none to accept.
    * @returns {object|null} `position_m`, `quaternion_wxyz`, `inliers`, `isAccepted`, `covariance`, `probability` and
-   *   `focalScale` as in Python, and `matches`: the point of each, x and y in shares of the picture, and how far it is off, 1 at most for inliers.
-   *   Null where there is no pose, or the picture has another shape than the map's, so that its camera is unknown.
+   *   `focalScale` as in Python, and `matches`: the point of each, x and y in shares of the image, and how far it is off, 1 at most for inliers.
+   *   Null where there is no pose, or the image has another shape than the map's, so that its camera is unknown.
    */
   localize(image, intrinsics = null, prior = null) {
     const camera = intrinsics ? cameraOf(intrinsics.flat()) : this.#cameraFor(image);
@@ -143,7 +143,7 @@ export class MapLocalizer {
     return [selected(this.#map.points_m, points, 3), selected(rays, keypoints, 2)];
   }
 
-  /** Points in the picture that one of the nearest key frames sees: what is hidden from there is not searched. */
+  /** Points in the image that one of the nearest key frames sees: what is hidden from there is not searched. */
   #visible({ corners: [left, top, right, bottom] }, pose, projected) {
     const here = viewpoint(pose, this.#unit_m);
     const apart = this.#viewpoints.map((there) => squareBetween(there, here));
@@ -159,7 +159,7 @@ export class MapLocalizer {
     return visible;
   }
 
-  /** Add where keypoints, and the picture's upper left and lower right corner, lie in the plane at depth 1. */
+  /** Add where keypoints, and the image's upper left and lower right corner, lie in the plane at depth 1. */
   #withRays(features, grey, camera) {
     const { fx, fy, cx, cy } = camera;
     const { lens, intrinsics, width, height } = this.#map;
@@ -173,7 +173,7 @@ export class MapLocalizer {
     return this.#matcher.turned({ ...features, rays, corners });
   }
 
-  /** The map's camera for a picture of its shape; null for another. */
+  /** The map's camera for an image of its shape; null for another. */
   #cameraFor(image) {
     const { width, height, intrinsics } = this.#map;
     if (Math.abs(image.width * height - image.height * width) > Math.max(width, height)) return null;
@@ -187,7 +187,7 @@ function turnBetween(a, b) {
   return (2 * Math.asin(Math.min(1, Math.sqrt(square / 8))) * 180) / Math.PI;
 }
 
-/** A camera's intrinsics once a picture is resized; corners stay corners. */
+/** A camera's intrinsics once an image is resized; corners stay corners. */
 function rescaled({ fx, fy, cx, cy }, from, to) {
   const [x, y] = [to.width / from.width, to.height / from.height];
   return { fx: x * fx, fy: y * fy, cx: x * cx + (x - 1) / 2, cy: y * cy + (y - 1) / 2 };

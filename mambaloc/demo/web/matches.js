@@ -1,12 +1,12 @@
-/** The map's points where the picture shows them. */
+/** The map's points where the image shows them. */
 
-const RADIUS = 2.75; // CSS pixels, less in a small picture
+const RADIUS = 2.75; // CSS pixels, less in a small image
 
 /**
- * Draw matches over the picture: those that agree with the pose as dots, coloured by how far they are off, by its root
+ * Draw matches over the image: those that agree with the pose as dots, coloured by how far they are off, by its root
  * since most are off by little; the others as rings.
- * @param {HTMLCanvasElement} canvas that lies on the picture.
- * @param {{x: number, y: number, off: number}[]} matches in shares of the picture; inliers are off by 1 at most.
+ * @param {HTMLCanvasElement} canvas that lies on the image.
+ * @param {{x: number, y: number, off: number}[]} matches in shares of the image; inliers are off by 1 at most.
  */
 export function drawMatches(canvas, matches) {
   const { clientWidth: width, clientHeight: height } = canvas;

@@ -1,4 +1,4 @@
-/** Matches between a picture's keypoints and a map's points. No DOM. */
+/** Matches between an image's keypoints and a map's points. No DOM. */
 
 import { LENGTH } from "./descriptors.js";
 
@@ -23,7 +23,7 @@ export class Matcher {
     this.#atOnce = Math.min(atOnce, this.#points.rests.length);
   }
 
-  /** Add the turned descriptors to a picture's features, for the methods below. */
+  /** Add the turned descriptors to an image's features, for the methods below. */
   turned(features) {
     return { ...features, turned: split(spectraOf(features.descriptors), this.#order) };
   }
@@ -94,7 +94,7 @@ export class Matcher {
 
 /**
  * Match keypoints with the points projected near them; each must be the other's best.
- * @param {{count: number, rays: Float64Array, descriptors: Float32Array}} features of the picture.
+ * @param {{count: number, rays: Float64Array, descriptors: Float32Array}} features of the image.
  * @param {number[]} visible points that may be seen.
  * @param {Float64Array} projected where every point of the map is, x, y in the plane at depth 1.
  * @param {Float32Array} descriptors of every point.

@@ -1,4 +1,4 @@
-/** Poses from pictures with an exported network. No DOM. */
+/** Poses from images with an exported network. No DOM. */
 
 import { framing } from "./framing.js";
 import { Preprocessor } from "./pictures.js";
@@ -29,12 +29,12 @@ export class Network {
   }
 
   /**
-   * Localize one picture.
+   * Localize one image.
    * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number, channels: 3|4}} image RGB or RGBA.
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels, which a model that takes none leaves unread; the
    *   training camera's unless given.
    * @returns `world_from_cam`: the camera centre in metres, a unit quaternion wxyz, and what it took; where the model
-   *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for a picture of elsewhere; where
+   *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for an image of elsewhere; where
    *   it knows several scenes, the likeliest one's name, probability, and offset in its world, in whose frame the pose is.
    */
   async localize(image, intrinsics = null) {

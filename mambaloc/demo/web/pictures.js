@@ -1,7 +1,7 @@
 /**
- * Pictures as the network and the map are given them. No DOM.
+ * Images as the network and the map are given them. No DOM.
  *
- * Every step does what `mambaloc/images.py` and `mambaloc/runtime` do with OpenCV, so that a picture looks as it did in
+ * Every step does what `mambaloc/images.py` and `mambaloc/runtime` do with OpenCV, so that an image looks as it did in
  * training.
  */
 
@@ -15,7 +15,7 @@ export class Preprocessor {
 
   /**
    * Resize, crop and scale; (height, width, channels) in 0..255 -> a new float32 (3, *crop) in 0..1, which is 0 where the
-   * picture does not reach.
+   * image does not reach.
    */
   apply(image, preprocessing) {
     const key = [image.width, image.height, preprocessing.short_side].join();
@@ -28,7 +28,7 @@ export class Preprocessor {
 }
 
 /**
- * The grey picture, so many times as wide; larger it never gets.
+ * The grey image, so many times as wide; larger it never gets.
  * @param {{data: Uint8Array|Uint8ClampedArray, width: number, height: number}} image RGB or RGBA.
  * @returns {{values: Uint8ClampedArray, width: number, height: number}}
  */
@@ -51,13 +51,13 @@ export function resizedSize({ width, height }, shortSide) {
   return [roundHalfToEven(height * scale), roundHalfToEven(width * scale)];
 }
 
-/** Throw where the model's crop does not fit into the resized picture; `orElse` is another way out. */
+/** Throw where the model's crop does not fit into the resized image; `orElse` is another way out. */
 export function checkHoldsCrop({ width, height }, { short_side, crop }, orElse = "") {
   const [newHeight, newWidth] = resizedSize({ width, height }, short_side);
   if (newHeight >= crop[0] && newWidth >= crop[1]) return;
-  const how = width < height ? "turn the camera sideways" : "give a picture shaped as in training";
+  const how = width < height ? "turn the camera sideways" : "give an image shaped as in training";
   throw new Error(
-    `A picture of ${width}×${height} is too narrow: resized to a short side of ${short_side} it does not hold the ` +
+    `An image of ${width}×${height} is too narrow: resized to a short side of ${short_side} it does not hold the ` +
       `model's crop of ${crop[1]}×${crop[0]}; ${how}${orElse}.`,
   );
 }
@@ -82,7 +82,7 @@ function areaTaps(source, target, first, count) {
   const [from, ends, weights] = [new Int32Array(count), new Int32Array(count + 1), []];
   for (let i = 0; i < count; i++) {
     ends[i + 1] = weights.length;
-    if (first + i < 0 || first + i >= target) continue; // beyond the picture
+    if (first + i < 0 || first + i >= target) continue; // beyond the image
     const start = (first + i) * scale;
     const end = start + scale;
     const cell = Math.min(scale, source - start);
@@ -100,7 +100,7 @@ function areaTaps(source, target, first, count) {
   return { from, ends, weights: Float32Array.from(weights) };
 }
 
-/** Averages of a picture's red, green and blue. */
+/** Averages of an image's red, green and blue. */
 function averagedColours({ data, width, channels }, areas) {
   const size = areas.rows.from.length * areas.columns.from.length;
   const planes = new Float32Array(3 * size);
@@ -145,7 +145,7 @@ function linearTaps(source, target, first, count, isRow) {
   const scale = 1 / (target / source);
   const [from, weights] = [new Int32Array(count), new Int32Array(2 * count)];
   for (let i = 0; i < count; i++) {
-    if (first + i < 0 || first + i >= target) continue; // beyond the picture
+    if (first + i < 0 || first + i >= target) continue; // beyond the image
     const centre = Math.fround((first + i + 0.5) * scale - 0.5);
     const floor = Math.floor(centre);
     const inside = floor >= 0 && floor < source - 1;

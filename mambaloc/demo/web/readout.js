@@ -51,7 +51,7 @@ export class Readout {
   /**
    * Show one answer.
    * @param pose of the localizer.
-   * @param {string} source that the picture is from.
+   * @param {string} source that the image is from.
    * @param {string} file of a test frame, or "".
    */
   show(pose, source, file = "") {
@@ -86,7 +86,7 @@ export class Readout {
     row.querySelector(".scale").hidden = source !== "map";
   }
 
-  /** Show what most poses are within, where that is known, and whether the picture is of the place at all. */
+  /** Show what most poses are within, where that is known, and whether the image is of the place at all. */
   #showUncertainty({ source, position_radius_m, rotation_radius_deg, unfamiliarity }) {
     const row = document.getElementById("uncertainty");
     row.hidden = position_radius_m === undefined;
@@ -99,7 +99,7 @@ export class Readout {
     shown("uncertainty-detail").textContent = isElsewhere ? "does not look like the place" : "";
   }
 
-  /** Show how far the film's camera is from its true pose, and the median of the run so far. */
+  /** Show how far the video's camera is from its true pose, and the median of the run so far. */
   showError(pose, truth, frame) {
     if (frame < this.#last) this.#errors = [];
     this.#last = frame;

@@ -1,14 +1,14 @@
-/** Pictures blurred more and more, and their differences (Lowe 2004, section 3), as OpenCV computes them. No DOM. */
+/** Images blurred more and more, and their differences (Lowe 2004, section 3), as OpenCV computes them. No DOM. */
 
 export const LAYERS = 3; // of an octave, in which extrema are searched
 export const SIGMA = 1.6; // of an octave's first layer, in its pixels
 export const BORDER = 5; // pixels of an octave without keypoints
-const CAMERA_SIGMA = 0.5; // that pictures come with
+const CAMERA_SIGMA = 0.5; // that images come with
 
-/** Octaves from twice the picture's size down: blurred layers and their differences. `pixel` is a pixel's size. */
+/** Octaves from twice the image's size down: blurred layers and their differences. `pixel` is a pixel's size. */
 export function octavesOf(grey) {
   const sigmas = Array.from({ length: LAYERS + 3 }, (_, i) => SIGMA * 2 ** (i / LAYERS));
-  const before = [2 * CAMERA_SIGMA, ...sigmas]; // the picture is doubled first
+  const before = [2 * CAMERA_SIGMA, ...sigmas]; // the image is doubled first
   const kernels = sigmas.map((sigma, i) => gaussian(Math.sqrt(sigma ** 2 - before[i] ** 2)));
   let base = blurred(doubled(grey), kernels[0]);
   const octaves = [];
@@ -21,7 +21,7 @@ export function octavesOf(grey) {
   return octaves;
 }
 
-/** Twice as large: every other pixel is one of the picture, those between are means. */
+/** Twice as large: every other pixel is one of the image, those between are means. */
 function doubled({ values, width, height }) {
   const [across, down] = [2 * width, 2 * height];
   const to = new Float32Array(across * down);

@@ -7,7 +7,7 @@ const TRAIL = 90;
 const ROD = new THREE.CylinderGeometry(1, 1, 1, 6);
 const ALONG = new THREE.Vector3(0, 1, 0);
 
-/** A camera as a pyramid with its picture on the far side. Lives in the scene's frame, with OpenCV's axes. */
+/** A camera as a pyramid with its image on the far side. Lives in the scene's frame, with OpenCV's axes. */
 export class Camera {
   #depth;
   #aspect = 0;
@@ -18,7 +18,7 @@ export class Camera {
 
   /**
    * @param {number} depth of the pyramid in metres.
-   * @param texture of the picture; without one the camera stays a wire frame.
+   * @param texture of the image; without one the camera stays a wire frame.
    */
   constructor(depth, texture = null) {
     this.#depth = depth;
@@ -50,7 +50,7 @@ export class Camera {
     const at = ([x, y]) => new THREE.Vector3(x * right, y * down, forward);
     const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(at);
     const centre = new THREE.Vector3();
-    const top = at([0, -1.35]); // a roof says which side of the picture is up
+    const top = at([0, -1.35]); // a roof says which side of the image is up
     const edges = corners.flatMap((corner, i) => [[centre, corner], [corner, corners[(i + 1) % 4]]]);
     edges.push([corners[0].clone().lerp(corners[1], 0.3), top], [corners[0].clone().lerp(corners[1], 0.7), top]);
     this.#struts.clear();

@@ -15,7 +15,7 @@ const EDGE = 10; // largest ratio of the principal curvatures
 const FIT_STEPS = 5;
 
 /**
- * Find the keypoints of a grey picture.
+ * Find the keypoints of a grey image.
  * @param {{values: ArrayLike<number>, width: number, height: number}} grey in 0..255.
  * @returns {{count: number, pixels: Float64Array, descriptors: Float32Array}} x, y of each keypoint, where the centre
  *   of the top left pixel is (0, 0), and 128 numbers of unit length.
@@ -112,7 +112,7 @@ function judged({ pixel, layers }, [column, row, layer], [dx, dy, dLayer], gradi
   };
 }
 
-/** Central differences along x, y and the layers of pictures in 0..1. */
+/** Central differences along x, y and the layers of images in 0..1. */
 function derivatives(differences, layer, at, width) {
   const [below, here, above] = [-1, 0, 1].map((step) => differences[layer + step].values);
   const first = [here[at + 1] - here[at - 1], here[at + width] - here[at - width], above[at] - below[at]];

@@ -1,14 +1,14 @@
-/** Where pictures come from: a film, the camera, or a file. */
+/** Where images come from: a video, the camera, or a file. */
 
 /** Pixels as the file has them, without colour management, as in training. EXIF's orientation is honoured anyway. */
 const AS_STORED = { colorSpaceConversion: "none", premultiplyAlpha: "none" };
 
-/** A bitmap of a picture file. */
+/** A bitmap of an image file. */
 export async function decoded(blob, name) {
   try {
     return await createImageBitmap(blob, AS_STORED);
   } catch {
-    throw new Error(`${name} is no picture that this browser can read; give a JPEG or PNG.`);
+    throw new Error(`${name} is no image that this browser can read; give a JPEG or PNG.`);
   }
 }
 
@@ -80,11 +80,11 @@ export class Film {
     return !type || document.createElement("video").canPlayType(type) !== "";
   }
 
-  /** Of the whole film in memory: it can then be wound back whatever server it is from. */
+  /** Of the whole video in memory: it can then be wound back whatever server it is from. */
   async url() {
     if (!this.#url) {
       const response = await fetch(this.file).catch(() => null);
-      if (!response?.ok) throw new Error("The film cannot be fetched: choose another source.");
+      if (!response?.ok) throw new Error("The video cannot be fetched: choose another source.");
       this.#url = URL.createObjectURL(await response.blob());
     }
     return this.#url;

@@ -63,7 +63,7 @@ export class View {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.paint());
   }
 
-  /** Show the film's true path too; null hides it. */
+  /** Show the video's true path too; null hides it. */
   showTruePath(poses) {
     if (this.#truePath) {
       this.#world.remove(this.#truePath);
@@ -91,7 +91,7 @@ export class View {
   }
 
   /**
-   * Keep the picture that the next pose is of.
+   * Keep the image that the next pose is of.
    * @param {CanvasImageSource} source
    */
   setPicture(source, width, height) {

@@ -35,7 +35,7 @@ self.onmessage = async ({ data }) => {
 };
 
 async function start({ backend: wanted, threads }) {
-  if (!self.OffscreenCanvas) throw new Error("This browser is too old to read pictures here; update it.");
+  if (!self.OffscreenCanvas) throw new Error("This browser is too old to read images here; update it.");
   const contract = JSON.parse(new TextDecoder().decode(await fetched("bundle/contract.json")));
   checkContract(contract);
   const file = modelOf(contract);
@@ -70,7 +70,7 @@ async function openMap(contract) {
   }
 }
 
-/** Load one backend, and let the model localize a grey picture: a backend that cannot says so here. */
+/** Load one backend, and let the model localize a grey image: a backend that cannot says so here. */
 async function open(backend, model, contract, map, most) {
   const { library, binary } = BACKENDS[backend];
   const ort = await import(new URL(library, VENDOR));
@@ -124,7 +124,7 @@ function pixels(bitmap) {
 /** A canvas multiplies colours by their opacity, which cannot be undone; in training opacity was dropped. */
 function refuseTransparent(data) {
   for (let i = 3; i < data.length; i += 4) {
-    if (data[i] !== 255) throw new Error("The picture has transparent parts: save it as a JPEG, and choose that.");
+    if (data[i] !== 255) throw new Error("The image has transparent parts: save it as a JPEG, and choose that.");
   }
 }
 

@@ -1,4 +1,4 @@
-// Localize pictures in a bundle's map.safetensors. C++17; OpenCV 4.8 or a later 4: core, imgproc, features2d, calib3d.
+// Localize images in a bundle's map.safetensors. C++17; OpenCV 4.8 or a later 4: core, imgproc, features2d, calib3d.
 //
 //   mambaloc::MapLocalizer localizer(bytes);                   // of the file; throws std::exception
 //   auto found = localizer.localize(rgb, intrinsics, &prior);  // prior: the network's pose, or nullptr
@@ -70,7 +70,7 @@ class MapLocalizer {
   // For a bridge to another language: height x width x 3 bytes, R G B; fx, fy, cx, cy in its pixels, or nullptr for the
   // map's own camera; the network's pose as x y z qw qx qy qz, or nullptr. Returns the same 7 numbers, the inliers, and
   // the covariance's 36; nothing where no pose is accepted, nor likelier to be right than the prior's, taken for 0.1; nor where the
-  // map's own camera does not have the picture's shape.
+  // map's own camera does not have the image's shape.
   std::vector<double> localize(const uint8_t* rgb, int height, int width, const double* camera, const double* prior) const {
     if (!camera && std::abs(width * size_.height - height * size_.width) > std::max(size_.width, size_.height)) return {};
     const cv::Matx33d k = camera ? cv::Matx33d(camera[0], 0, camera[2], 0, camera[1], camera[3], 0, 0, 1)
@@ -98,7 +98,7 @@ class MapLocalizer {
  private:
   struct Features {
     std::vector<cv::Vec2d> rays;    // where keypoints lie in the plane at depth 1
-    std::vector<cv::Vec2d> shares;  // and in the picture, whose corners are (0, 0) and (1, 1)
+    std::vector<cv::Vec2d> shares;  // and in the image, whose corners are (0, 0) and (1, 1)
     cv::Mat descriptors;            // (N, 128) float, unit length
     cv::Vec2d upper_left, lower_right;
   };
@@ -126,7 +126,7 @@ class MapLocalizer {
   }
 
   Features detect(const cv::Mat& rgb, const cv::Matx33d& k) const {
-    const double scale = std::min(1.0, intrinsics_(0, 0) / k(0, 0));  // things as large as in the map's pictures
+    const double scale = std::min(1.0, intrinsics_(0, 0) / k(0, 0));  // things as large as in the map's images
     const cv::Size size(std::max(1, cvRound(rgb.cols * scale)), std::max(1, cvRound(rgb.rows * scale)));
     cv::Mat grey, found;
     cv::cvtColor(rgb, grey, cv::COLOR_RGB2GRAY);

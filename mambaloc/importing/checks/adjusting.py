@@ -1,4 +1,4 @@
-"""Poses and focal lengths of a capture adjusted to its pictures: an offer beside those given, not a replacement."""
+"""Poses and focal lengths of a capture adjusted to its images: an offer beside those given, not a replacement."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ class Adjusted:
 
 
 def adjust_poses(capture: Capture) -> Adjusted:
-    """Adjust poses and lenses to what the pictures show; the given ones, and depth where there is some, are priors.
+    """Adjust poses and lenses to what the images show; the given ones, and depth where there is some, are priors.
 
     Args:
         capture: its images are those of pinholes.
 
     Raises:
-        InputError: where its pictures give too few points.
+        InputError: where its images give too few points.
     """
     every, stride = np.arange(len(capture.images)), -(-len(capture.images) // _MOST_FRAMES)
     rows = every[::stride]
@@ -79,7 +79,7 @@ def adjust_poses(capture: Capture) -> Adjusted:
         found = pool.map(lambda row: searched(capture, row), rows.tolist())
         features = list(shown(found, "Finding keypoints", len(rows)))
         of_pairs = pool.map(lambda pair: match(features[pair[0]], features[pair[1]]), pairs.tolist())
-        matches = list(shown(of_pairs, "Matching pictures", len(pairs)))
+        matches = list(shown(of_pairs, "Matching images", len(pairs)))
     depth = None
     if capture.depth is not None:
         depth = [sampled(capture.depth, row, each.rays) for row, each in zip(rows.tolist(), features, strict=True)]
@@ -87,7 +87,7 @@ def adjust_poses(capture: Capture) -> Adjusted:
     structure = recover_structure(features, given, pairs, matches, np.random.default_rng(0), depth, camera)
     if len(structure.points_m) < _LEAST_POINTS:
         raise InputError(
-            f"--adjust-poses: the pictures give {len(structure.points_m)} points. Film more texture, or leave it out."
+            f"--adjust-poses: the images give {len(structure.points_m)} points. Film more texture, or leave it out."
         )
     after = structure.world_from_cam
     quaternion = (quaternion_from_matrix(each[:, :3, :3]) for each in (given, after))
@@ -114,7 +114,7 @@ def _cameras(capture: Capture, rows: Indices) -> tuple[list[str], Indices | None
 def _focal(
     names: Sequence[str], lenses: Sequence[Lens], features: Sequence[Features], camera: Indices
 ) -> dict[str, float]:
-    """The focal length of the pinhole that is nearest to each lens where pictures have keypoints, over that given."""
+    """The focal length of the pinhole that is nearest to each lens where images have keypoints, over that given."""
     found = {}
     for number, (name, lens) in enumerate(zip(names, lenses, strict=True)):
         rays = [each.rays for each, own in zip(features, camera == number, strict=True) if own]

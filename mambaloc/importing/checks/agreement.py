@@ -1,4 +1,4 @@
-"""Whether a capture's pictures agree with its poses and its camera, and what would make them."""
+"""Whether a capture's images agree with its poses and its camera, and what would make them."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ _OF_EITHER_DIRECTION = ("csv", "pose_lines", "pose_files")  # formats that may b
 
 @dataclass(frozen=True)
 class Agreement:
-    """How many matches between a capture's pictures agree with its poses and its camera.
+    """How many matches between a capture's images agree with its poses and its camera.
 
     Args:
         share: of matches between neighbours, by convention.
         matches: between neighbours.
         pairs: of neighbours.
-        bins: the share by how far pictures are apart.
+        bins: the share by how far images are apart.
         focal_share: the share at each of :data:`~mambaloc.importing.checks.epipolar.FOCALS`.
         focal_px: of the first frame's camera, along x.
         is_guessed: the focal length is a guess, since the format gives none.
-        order: another association of pictures with poses that fits clearly better.
+        order: another association of images with poses that fits clearly better.
         depth: what depth says, where the capture has some.
-        adjusted: poses adjusted to the pictures, where they were asked for.
+        adjusted: poses adjusted to the images, where they were asked for.
         kind: the capture's format.
     """
 
@@ -89,15 +89,15 @@ class Agreement:
 
 
 def agreement(capture: Capture, motion: Motion, with_adjusted: bool = False) -> Agreement:
-    """Compare a capture's pictures with its poses and its camera.
+    """Compare a capture's images with its poses and its camera.
 
     Args:
         capture: its images are those of pinholes, where it has cameras.
         motion: its.
-        with_adjusted: also adjust the poses to the pictures.
+        with_adjusted: also adjust the poses to the images.
 
     Raises:
-        InputError: for a depth frame that is damaged, a camera that cannot be that of its pictures, or pictures too
+        InputError: for a depth frame that is damaged, a camera that cannot be that of its images, or images too
             bare to adjust the poses.
     """
     matches, poses = find_matches(capture, motion), capture.world_from_cam
@@ -118,7 +118,7 @@ def agreement(capture: Capture, motion: Motion, with_adjusted: bool = False) -> 
 
 
 def check_agreement(found: Agreement) -> list[Finding]:
-    """Say whether pictures agree with poses and camera, and what to do where they do not; the first says all in one."""
+    """Say whether images agree with poses and camera, and what to do where they do not; the first says all in one."""
     figures: dict[str, Any] = {
         "matches": found.matches,
         "pairs": found.pairs,
@@ -162,7 +162,7 @@ def _contradiction(found: Agreement) -> str:
     order = found.order
     if order is not None and order.share >= _AGREE and not found.is_of_another_lens:
         return (
-            f"the pictures fit {order.name} better: {order.share:.0%} of matches agree, {order.as_read:.0%} as they "
+            f"the images fit {order.name} better: {order.share:.0%} of matches agree, {order.as_read:.0%} as they "
             "were read; correct the time stamps, or the order of the files"
         )
     if found.is_guessed and max(share, float(found.focal_share.max())) < _AGREE:
@@ -200,7 +200,7 @@ def _check_focal(found: Agreement) -> Finding:
     if found.is_of_another_lens and found.best == AS_READ:
         concern = (
             f"the focal length looks like {focal_px:.0f} px rather than {found.focal_px:.0f}: {best:.0%} of matches "
-            f"agree, not {given:.0%}; check that the intrinsics are of pictures of this size"
+            f"agree, not {given:.0%}; check that the intrinsics are of images of this size"
         )
     return Finding("focal length", said, concern, figures=figures)
 
@@ -220,7 +220,7 @@ def _check_depth(found: ByDepth, focal_px: float) -> Finding:
     if abs(found.focal - 1) > _SAME_FOCAL and found.given_px > _WORSE * found.focal_px.min():
         concern = (
             f"depth fits a focal length of {found.focal * focal_px:.0f} px better than {focal_px:.0f}: matches are "
-            f"{found.focal_px.min():.1f} px off, not {found.given_px:.1f}; check the intrinsics of pictures and depth"
+            f"{found.focal_px.min():.1f} px off, not {found.given_px:.1f}; check the intrinsics of images and depth"
         )
     return Finding("depth", said, concern, figures=figures)
 

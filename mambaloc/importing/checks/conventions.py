@@ -63,12 +63,12 @@ def up_of(capture: Capture) -> Up:
 
 
 def check_up(capture: Capture, up: Up, are_contradicted: bool = False) -> Finding:
-    """Say which way is up, and whether the pictures lie on their side.
+    """Say which way is up, and whether the images lie on their side.
 
     Args:
         capture: of posed images.
         up: of its cameras.
-        are_contradicted: the pictures contradict the poses, which then say nothing of how the pictures lie.
+        are_contradicted: the images contradict the poses, which then say nothing of how the images lie.
     """
     figures = {
         "direction": up.direction.round(4).tolist(),
@@ -81,7 +81,7 @@ def check_up(capture: Capture, up: Up, are_contradicted: bool = False) -> Findin
     concern = ""
     if sideways >= _COMMON and sideways > up.common + _ON_THEIR_SIDE and not are_contradicted:
         concern = (
-            "the pictures seem to lie on their side: the cameras' x axis, not y, keeps a direction; pictures to "
+            "the images seem to lie on their side: the cameras' x axis, not y, keeps a direction; images to "
             "localize must lie so, too"
         )
     if not up.is_known:

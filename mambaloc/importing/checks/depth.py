@@ -1,7 +1,7 @@
-"""Focal length and turns of a capture by its depth: matches lifted out of one picture and projected into the other.
+"""Focal length and turns of a capture by its depth: matches lifted out of one image and projected into the other.
 
 In matches alone, a focal length that is too long and turns that are too small look alike. Depth says where a match must
-lie in the other picture, not only on which line.
+lie in the other image, not only on which line.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LEAST_MATCHES = 100
 @dataclass(frozen=True)
 class ByDepth:
     """How far matches lie from where depth and poses put them, were the longer side of
-    the pictures 640 pixels.
+    the images 640 pixels.
 
     Shape:
         ``focal_px`` and ``turn_px``: medians at each of :data:`SCALES`, of the focal length with the turns as they are,
@@ -40,7 +40,7 @@ class ByDepth:
 
     Args:
         matches: that have a depth.
-        pairs: of pictures.
+        pairs: of images.
     """
 
     focal_px: Floats
@@ -68,8 +68,8 @@ def by_depth(capture: Capture, matches: Matches) -> ByDepth | None:
     """Try focal lengths and turns on matches that have a depth; None where there are too few.
 
     Args:
-        capture: whose depth, where it has some, is of pictures without distortion.
-        matches: between its pictures.
+        capture: whose depth, where it has some, is of images without distortion.
+        matches: between its images.
 
     Raises:
         InputError: for a depth frame that is damaged.
@@ -97,7 +97,7 @@ def by_depth(capture: Capture, matches: Matches) -> ByDepth | None:
 
 
 def depth_of_matches(depth: Depth, matches: Matches) -> Floats:
-    """Depths of matches in their first pictures, in the capture's unit, (M,); NaN where none was measured.
+    """Depths of matches in their first images, in the capture's unit, (M,); NaN where none was measured.
 
     Raises:
         InputError: for a depth frame that is damaged.

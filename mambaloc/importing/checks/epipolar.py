@@ -1,6 +1,6 @@
-"""Which matches between pictures agree with a capture's poses and its camera, or with others in their stead.
+"""Which matches between images agree with a capture's poses and its camera, or with others in their stead.
 
-A pair of poses draws a line in one picture for each point of the other. Where poses, pictures and camera belong
+A pair of poses draws a line in one image for each point of the other. Where poses, images and camera belong
 together nearly every match lies near its line, and in front of both cameras.
 """
 
@@ -21,7 +21,7 @@ from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_de
 Floats = NDArray[np.floating[Any]]
 
 NEAR_PX = 1.5
-"""How far a match may be from its line, were the longer side of the pictures 640 pixels."""
+"""How far a match may be from its line, were the longer side of the images 640 pixels."""
 
 FOCALS = np.round(1.0125 ** np.arange(-28, 28), 4)
 """Focal lengths that are tried, over that of the capture."""
@@ -34,7 +34,7 @@ _FOCAL_MATCHES = 400
 
 @dataclass(frozen=True)
 class Bin:
-    """Pairs of pictures that are about as far apart.
+    """Pairs of images that are about as far apart.
 
     Args:
         low: shortest baseline, in the capture's unit.
@@ -61,7 +61,7 @@ def agrees(matches: Matches, world_from_cam: Floats, focal: float = 1.0) -> NDAr
     """Which matches lie near their epipolar line and in front of both cameras, (M,).
 
     Args:
-        matches: between pictures of N frames.
+        matches: between images of N frames.
         world_from_cam: of each frame, (N, 4, 4).
         focal: focal length over that of the matches' camera.
     """
@@ -76,10 +76,10 @@ def agrees(matches: Matches, world_from_cam: Floats, focal: float = 1.0) -> NDAr
 
 
 def by_baseline(matches: Matches, world_from_cam: Floats, adjusted: Floats | None = None) -> list[Bin]:
-    """The share of matches that agree by how far pictures are apart, with the most that any poses could reach.
+    """The share of matches that agree by how far images are apart, with the most that any poses could reach.
 
     Args:
-        matches: between pictures of N frames.
+        matches: between images of N frames.
         world_from_cam: of each frame, (N, 4, 4).
         adjusted: other poses of the frames, in the same bins.
     """
@@ -123,7 +123,7 @@ def best_focal(share: Floats) -> float:
 
 
 def apart_of(matches: Matches, world_from_cam: Floats) -> tuple[Floats, Floats]:
-    """How far the pictures of each pair are apart, in the capture's unit and in degrees, (P,) each."""
+    """How far the images of each pair are apart, in the capture's unit and in degrees, (P,) each."""
     first, second = world_from_cam[matches.pairs.T]
     turn_deg = rotation_error_deg(*(quaternion_from_matrix(each[:, :3, :3]) for each in (first, second)))
     return np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1), turn_deg

@@ -1,4 +1,4 @@
-"""What would make poses and pictures agree where they do not: another convention, another order, a delay.
+"""What would make poses and images agree where they do not: another convention, another order, a delay.
 
 No pose file says for sure in which direction its poses transform, nor which way its cameras look, and where images and
 poses are associated by their order or by two clocks they may belong to other frames.
@@ -59,7 +59,7 @@ _DEVIATIONS = 3.0
 
 @dataclass(frozen=True)
 class Order:
-    """Another association of pictures with poses that clearly more matches agree with.
+    """Another association of images with poses that clearly more matches agree with.
 
     Args:
         name: which.
@@ -79,7 +79,7 @@ def by_convention(matches: Matches, world_from_cam: Floats) -> dict[str, float]:
 
 
 def better_order(capture: Capture, matches: Matches) -> Order | None:
-    """Find the association of pictures with poses that most matches agree with, where it is clearly another."""
+    """Find the association of images with poses that most matches agree with, where it is clearly another."""
     near = matches.of_pairs(np.arange(matches.neighbours))
     found: Order | None = None
     for name, pose_of in _orders(capture.sequences, capture.images).items():
@@ -100,12 +100,12 @@ def better_order(capture: Capture, matches: Matches) -> Order | None:
 
 
 def _orders(sequences: Sequence[str], images: Sequence[Path]) -> dict[str, Indices]:
-    """Which row's pose each picture would have, (N,); -1 where none."""
+    """Which row's pose each image would have, (N,); -1 where none."""
     every, of = np.arange(len(images)), np.array(sequences)
     orders = {"the poses in reverse": np.empty_like(every)}
     by_name: dict[str, Callable[[Path], Any]] = {
-        "the pictures sorted as text": lambda image: image.name,
-        "the pictures sorted by the numbers in their names": natural,
+        "the images sorted as text": lambda image: image.name,
+        "the images sorted by the numbers in their names": natural,
     }
     orders |= {name: np.empty_like(every) for name in by_name}
     shifts = [shift for shift in range(-_MOST_SHIFT, _MOST_SHIFT + 1) if shift]

@@ -1,4 +1,4 @@
-"""Matches between pictures of a capture: what its poses and its camera are checked against."""
+"""Matches between images of a capture: what its poses and its camera are checked against."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Indices = NDArray[np.int64]
 T = TypeVar("T")
 
 LONG_SIDE_PX = 640
-"""Longest side of the pictures in which keypoints are searched."""
+"""Longest side of the images in which keypoints are searched."""
 
 _NEIGHBOURS = 16  # frames, with another that is turned little and one that is turned more
 _OFFSETS = (32, 24, 16, 12, 8, 6, 4, 3, 2, 1)  # frames from one of a pair to the other; far apart they tell more
@@ -38,11 +38,11 @@ _MOST_FRAMES = 32  # that pairs by pose are chosen from
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches of pairs of pictures, laid end to end.
+    """Matches of pairs of images, laid end to end.
 
     Shape:
         ``pairs`` (P, 2) rows of the capture; ``pair`` (M,) ascending; ``first`` and ``second`` (M, 2), where keypoints
-        lie in the plane at depth 1 of their cameras; ``focal_px`` (P,) in pictures whose longer side is 640 pixels.
+        lie in the plane at depth 1 of their cameras; ``focal_px`` (P,) in images whose longer side is 640 pixels.
 
     Args:
         pairs: neighbours in time come first.
@@ -77,7 +77,7 @@ class Matches:
 
 
 def find_matches(capture: Capture, motion: Motion) -> Matches:
-    """Match pictures that follow each other, and pictures that the poses say show the same from apart.
+    """Match images that follow each other, and images that the poses say show the same from apart.
 
     Args:
         capture: its images are those of pinholes, where it has cameras.
@@ -90,7 +90,7 @@ def find_matches(capture: Capture, motion: Motion) -> Matches:
         of_rows = pool.map(lambda row: searched(capture, row), rows.tolist())
         features = dict(zip(rows.tolist(), shown(of_rows, "Finding keypoints", len(rows)), strict=True))
         of_pairs = pool.map(lambda pair: match(features[pair[0]], features[pair[1]]), pairs.tolist())
-        matched = list(zip(pairs.tolist(), shown(of_pairs, "Matching pictures", len(pairs)), strict=True))
+        matched = list(zip(pairs.tolist(), shown(of_pairs, "Matching images", len(pairs)), strict=True))
     first, second = (
         np.concatenate([np.empty((0, 2)), *(features[pair[side]].rays[rows[:, side]] for pair, rows in matched)])
         for side in (0, 1)
@@ -129,13 +129,13 @@ def neighbours(capture: Capture, motion: Motion) -> list[tuple[int, int]]:
 
 
 def searched(capture: Capture, row: int) -> Features:
-    """The keypoints of a frame's picture, made smaller where it is large."""
+    """The keypoints of a frame's image, made smaller where it is large."""
     image = read_image(capture.images[row])
     return detect_features(image, intrinsics(capture, row, image), LONG_SIDE_PX / max(image.shape[:2]))
 
 
 def intrinsics(capture: Capture, row: int, image: Image | None = None) -> Floats:
-    """The pinhole matrix of a frame, (3, 3), in pixels of its picture; an assumed one where the format gives none."""
+    """The pinhole matrix of a frame, (3, 3), in pixels of its image; an assumed one where the format gives none."""
     if capture.camera_of is None:
         height, width = (read_image(capture.images[row]) if image is None else image).shape[:2]
         return assumed_intrinsics((width, height))

@@ -123,12 +123,12 @@ def check_sizes(sizes: Sequence[tuple[int, int]]) -> Finding:
 
 
 def check_pixels(decoding: Decoding) -> Finding:
-    """Say which pixels of a picture with an EXIF orientation its pose means."""
+    """Say which pixels of an image with an EXIF orientation its pose means."""
     concern = ""
     if decoding.stored and not decoding.known:
         concern = (
-            f"{len(decoding.stored)} pictures have an EXIF orientation, and the format does not say whether poses mean "
-            "stored or upright pixels: taken as stored. If they mean upright ones, write the pictures so first, as "
+            f"{len(decoding.stored)} images have an EXIF orientation, and the format does not say whether poses mean "
+            "stored or upright pixels: taken as stored. If they mean upright ones, write the images so first, as "
             "mogrify -auto-orient does"
         )
     figures = {"turned": len(decoding.turned), "stored": len(decoding.stored)}
@@ -172,12 +172,12 @@ def check_duplicates(capture: Capture, motion: Motion) -> Finding:
         first, last = (capture.images[run[end]].name for end in (0, -1))
         concern = (
             f"{many} frames have exactly the pose of another, most in a row {first} to {last} ({len(run)} frames): a "
-            "tracker that is lost repeats its last pose; if these pictures show that the camera moved, take them and "
+            "tracker that is lost repeats its last pose; if these images show that the camera moved, take them and "
             "their poses out of the capture and import it again"
         )
     elif many > _MANY * len(grid):
         concern = (
-            f"{many} frames have exactly the pose of another: pictures may be there twice, or poses with too few "
+            f"{many} frames have exactly the pose of another: images may be there twice, or poses with too few "
             "digits; remove copies, or export poses with six decimals"
         )
     return Finding("duplicate poses", f"{many}", concern, figures={"count": many})

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX, pictures, read_image
+from mambaloc.images import CORNER_PX, list_images, read_image
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import (
     Posed,
@@ -34,7 +34,7 @@ from mambaloc.importing.formats.builder import (
     pinhole,
     validate_se3,
 )
-from mambaloc.importing.formats.parsing import array_of, first_with_pictures, folder_name, number_of, read_object
+from mambaloc.importing.formats.parsing import array_of, first_with_images, folder_name, number_of, read_object
 from mambaloc.text import natural
 
 _OFF_CENTER = 0.05
@@ -68,8 +68,8 @@ def read_record3d(source: Path) -> Capture:
     quaternion = np.roll(rows[:, :4], 1, axis=1)
     checked = from_quaternions(rows[:, 4:], quaternion, lambda row: f"{path}: poses, row {row}")
     checked @= OPENCV_FROM_OPENGL
-    folder = first_with_pictures([source / "rgbd", source / "rgb"])
-    images = pictures(folder)
+    folder = first_with_images([source / "rgbd", source / "rgb"])
+    images = list_images(folder)
     numbered = {number_of(image): image for image in images}
     names, cameras = told_apart(_record3d_cameras(metadata, path, len(rows)))
     stamps = metadata.get("frameTimestamps")
@@ -103,7 +103,7 @@ def read_polycam(source: Path) -> Capture:
     files = sorted(folders[0].glob("*.json"), key=natural) if folders else []
     if folders is None or not files:
         raise InputError(f"{source}: has no keyframes/cameras/STAMP.json; export 'raw data' in developer mode")
-    images = {image.stem: image for image in pictures(folders[1])}
+    images = {image.stem: image for image in list_images(folders[1])}
     sequence, present = folder_name(source), [file for file in files if file.stem in images]
     read = [_polycam_frame(file, images[file.stem]) for file in present]
     matrices = np.array([matrix for matrix, _ in read]).reshape(-1, 3, 4)

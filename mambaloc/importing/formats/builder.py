@@ -21,7 +21,7 @@ Matrices = NDArray[np.float64]
 SHORTEST, LONGEST = 0.5 - 1e-3, 2.0 + 1e-3
 """Lengths of quaternions that are made units, and their rounding."""
 _ROUNDED = 1e-6  # of a rotation's entries
-_NONE_LISTED = "a split of its own that names none of the frames that have a pose and a picture"
+_NONE_LISTED = "a split of its own that names none of the frames that have a pose and an image"
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Calibration files of the layout of DSAC* and ACE, in which Wayspots are: ``calibration/X.txt`` beside ``rgb/X.jpg``.
 
-A file has a focal length in pixels, with the principal point in the picture's middle, or a 3x3 matrix. Files and
-pictures belong together in their order. Pixels count from the image's corner: the loader scales the principal point as
+A file has a focal length in pixels, with the principal point in the image's middle, or a 3x3 matrix. Files and
+images belong together in their order. Pixels count from the image's corner: the loader scales the principal point as
 it does the focal length. Source: ``dataset.py`` of github.com/nianticlabs/ace (Brachmann et al. 2023).
 """
 
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import CORNER_PX, pictures
+from mambaloc.images import CORNER_PX, list_images
 from mambaloc.importing.capture import Camera
 from mambaloc.importing.formats.builder import pinhole
 from mambaloc.importing.formats.nerfstudio_cameras import first_size
@@ -41,9 +41,9 @@ def calibrated(source: Path, images: Sequence[Path]) -> tuple[dict[Path, Camera]
         calibrations = folder.parent / _FOLDER
         if folder == source or not calibrations.is_dir():
             return {}, ""
-        files, beside = sorted(calibrations.glob("*.txt"), key=natural), pictures(folder)
+        files, beside = sorted(calibrations.glob("*.txt"), key=natural), list_images(folder)
         if len(files) != len(beside):
-            return {}, f"none: {calibrations} has {len(files)} files, and {folder} {len(beside)} pictures"
+            return {}, f"none: {calibrations} has {len(files)} files, and {folder} {len(beside)} images"
         size = first_size(beside)
         cameras |= {image: _camera(file, size) for image, file in zip(beside, files, strict=True)}
     return cameras, ""

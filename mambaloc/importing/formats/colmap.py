@@ -24,8 +24,8 @@ from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, LARGEST_SIDE_PX
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
-from mambaloc.importing.formats.finding import SMALLER, Found, count_there, find_pictures
-from mambaloc.importing.formats.parsing import folder_name, pictures_beside
+from mambaloc.importing.formats.finding import SMALLER, Found, count_there, find_images
+from mambaloc.importing.formats.parsing import folder_name, images_in_same_folders
 from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 from mambaloc.text import natural
 
@@ -85,7 +85,7 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
         **found.choices,
         **checked.choices,
     }
-    beside = pictures_beside(each.image for each in posed)
+    beside = images_in_same_folders(each.image for each in posed)
     capture = build_capture(
         "colmap", source, posed, unit="unknown", choices=choices, cameras=cameras, missing=missing, beside=beside
     )
@@ -140,7 +140,7 @@ def _find(source: Path, model: Path, images: Path | None, names: list[str]) -> F
         folder, most = (candidate, count) if count > most else (folder, most)
         if most == len(names):
             break
-    return find_pictures(folder, [(name, f"{model}, images") for name in names])
+    return find_images(folder, [(name, f"{model}, images") for name in names])
 
 
 def _sequence(name: str, source: Path) -> str:

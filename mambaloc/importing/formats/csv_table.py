@@ -8,7 +8,7 @@ and an unknown unit in any other. The quaternion is what a dataset's own labels 
 camera-to-world, of Cambridge Landmarks **world-to-camera**, and no column says which. So it is taken as
 camera-to-world, unless a row is of a Cambridge scene: then the format must be named, ``csv_world_from_cam`` or
 ``csv_cam_from_world``. ``q1`` to ``q4`` are scalar first in TransPoseNet's table, and refused in any other. A table
-without a column of images has a time, by which its rows are associated with pictures that are named by theirs.
+without a column of images has a time, by which its rows are associated with images that are named by theirs.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import pictures
+from mambaloc.images import list_images
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
 from mambaloc.importing.formats.column_names import scale_of
-from mambaloc.importing.formats.finding import Found, count_there, find_pictures
+from mambaloc.importing.formats.finding import Found, count_there, find_images
 from mambaloc.importing.formats.parsing import (
     as_numbers,
-    first_with_pictures,
+    first_with_images,
     folder_name,
-    pictures_beside,
+    images_in_same_folders,
     read_text,
 )
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS
@@ -47,8 +47,8 @@ Row = tuple[int, dict[str, str]]
 
 
 @dataclass(frozen=True)
-class _Pictured:
-    """Pictures of a table: each with its sequence, row and time; how they were found, and those that are not there."""
+class _TableImages:
+    """Images of a table: each with its sequence, row and time; how they were found, and those that are not there."""
 
     frames: list[tuple[Path, str, int, float | None]]
     how: str
@@ -103,7 +103,7 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
         "association": pictured.how,
         **checked.choices,
     }
-    beside = pictures_beside(each.image for each in posed)
+    beside = images_in_same_folders(each.image for each in posed)
     missing = pictured.missing
     kind = "csv" if direction is None else f"csv_{direction}"
     unit: Unit = "metre" if is_known else "unknown"
@@ -201,7 +201,7 @@ def _turned(quaternion: np.ndarray, direction: Direction | None) -> np.ndarray:
     return quaternion * (1, -1, -1, -1) if direction == "cam_from_world" else quaternion
 
 
-def _by_image(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> _Pictured:
+def _by_image(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> _TableImages:
     folder, found = _images(path, rows, columns, given)
     images, how = found.files, "; ".join(filter(None, ("by name", found.elsewhere)))
     stamps = None
@@ -218,15 +218,15 @@ def _by_image(path: Path, rows: list[Row], columns: TableColumns, given: Path | 
             name = sequence if sequence not in ("", ".") else folder_name(folder)
             frames.append((image, name, place, None if stamps is None else float(stamps.seconds[place])))
     missing = [row[str(columns.image)] for (_, row), image in zip(rows, images, strict=True) if not image.is_file()]
-    return _Pictured(frames, how if stamps is None else f"{how}; timed in {stamps.unit}", missing)
+    return _TableImages(frames, how if stamps is None else f"{how}; timed in {stamps.unit}", missing)
 
 
-def _by_time(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> _Pictured:
-    images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
+def _by_time(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> _TableImages:
+    images = list_images(first_with_images([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, [row[str(columns.time)] for _, row in rows], path)
     name = folder_name(path.parent)
     frames = [(image, name, row, time_s) for image, row, time_s in pairing.frames]
-    return _Pictured(sorted(frames, key=lambda frame: frame[3] or 0.0), pairing.how, pairing.missing)
+    return _TableImages(sorted(frames, key=lambda frame: frame[3] or 0.0), pairing.how, pairing.missing)
 
 
 def _images(path: Path, rows: list[Row], columns: TableColumns, given: Path | None) -> tuple[Path, Found]:
@@ -237,7 +237,7 @@ def _images(path: Path, rows: list[Row], columns: TableColumns, given: Path | No
     root = given or path.parent
     candidates = [(root, whole), (root / "images", whole), (root, within)]
     folder, named = max(candidates, key=lambda each: count_there(each[0], [name for name, _ in each[1]]))
-    return folder, find_pictures(folder, named)
+    return folder, find_images(folder, named)
 
 
 def _split(path: Path, line: int, row: dict[str, str]) -> str | None:

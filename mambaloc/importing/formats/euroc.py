@@ -22,8 +22,15 @@ from mambaloc.errors import InputError
 from mambaloc.files import parse_yaml
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole, validate_se3
-from mambaloc.importing.formats.finding import find_pictures
-from mambaloc.importing.formats.parsing import Table, array_of, as_numbers, folder_name, pictures_beside, read_text
+from mambaloc.importing.formats.finding import find_images
+from mambaloc.importing.formats.parsing import (
+    Table,
+    array_of,
+    as_numbers,
+    folder_name,
+    images_in_same_folders,
+    read_text,
+)
 from mambaloc.importing.formats.timing import by_time, stamps_of
 from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 
@@ -73,7 +80,7 @@ def read_euroc(source: Path, images: Path | None = None) -> Capture:
     if short is not None or not listed:
         raise InputError(f"{listing}, line {short or 1}: is no row 'timestamp, filename'; correct or remove it")
     camera, body_from_cam = _camera(folder / "cam0/sensor.yaml")
-    found = find_pictures(images or listing.parent / "data", [(row[1], f"{listing}, line {n}") for n, row in listed])
+    found = find_images(images or listing.parent / "data", [(row[1], f"{listing}, line {n}") for n, row in listed])
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     stamps = stamps_of([listed[row][1][0] for row in there])
     if stamps is None:
@@ -108,7 +115,7 @@ def read_euroc(source: Path, images: Path | None = None) -> Capture:
         },
         cameras={"cam0": camera},
         missing=[listed[row][1][1] for row, file in enumerate(found.files) if file in found.missing],
-        beside=pictures_beside(found.files[row] for row in there),
+        beside=images_in_same_folders(found.files[row] for row in there),
     )
 
 

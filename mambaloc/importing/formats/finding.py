@@ -1,4 +1,4 @@
-"""Where the pictures are that a source names: by their paths, or by the ends of these below one folder.
+"""Where the images are that a source names: by their paths, or by the ends of these below one folder.
 
 Paths are often those of another machine, or of the folder that a tool was called in. Nothing outside of the folder is
 looked at, and the search follows no symbolic link.
@@ -18,22 +18,22 @@ from typing import Any
 
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside
-from mambaloc.images import PICTURES, pictures
+from mambaloc.images import IMAGE_SUFFIXES, list_images
 
 SMALLER = ("_2", "_4", "_8")
 """What the folders of smaller copies add to a folder's name, the largest first: those of splatting data sets."""
 
-_OTHER = re.compile(r"depth|mask|semantic|label|normal|confidence", re.IGNORECASE)  # folders of no pictures
+_OTHER = re.compile(r"depth|mask|semantic|label|normal|confidence", re.IGNORECASE)  # folders of no images
 _MOST_FILES = 1_000_000
 _LONGEST_NAME = 255  # bytes
-_GIVE = "Give the folder of the pictures with --images."
+_GIVE = "Give the folder of the images with --images."
 
 Parts = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Found:
-    """Where the pictures are that a source names.
+    """Where the images are that a source names.
 
     Args:
         files: of each name, there or not.
@@ -51,12 +51,12 @@ class Found:
         return {"pictures": self.elsewhere} if self.elsewhere else {}
 
 
-def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
-    """Find pictures by the paths that a source has for them, with a picture's suffix or without.
+def find_images(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
+    """Find images by the paths that a source has for them, with an image's suffix or without.
 
-    A picture that is not where its path says is looked for in the folders of smaller copies, as ``images_4`` of
+    An image that is not where its path says is looked for in the folders of smaller copies, as ``images_4`` of
     ``images``, and then by the longest end of its path that a file below the root has. An end of the file's name alone
-    counts only where all paths are of one folder: otherwise the folder may be what tells pictures apart. A picture with
+    counts only where all paths are of one folder: otherwise the folder may be what tells images apart. An image with
     another suffix counts where its folder is called as the path says, or is the root: elsewhere it may be depth.
 
     Args:
@@ -64,8 +64,8 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
         named: paths, with either kind of slash, and what names each, for messages; in JSON a path may be anything.
 
     Raises:
-        InputError: for a path that no file has, that leads out of the root where no picture below ends like it, or that
-            may mean two pictures; and where no picture is there.
+        InputError: for a path that no file has, that leads out of the root where no image below ends like it, or that
+            may mean two images; and where no image is there.
     """
     direct = [path_inside(root, name) if isinstance(name, str) else None for name, _ in named]
     files = [None if path is None else _there(root, path) for path in direct]
@@ -78,7 +78,7 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
     if outside and not any(files[row] for row in outside):
         name, where = named[outside[0]]
         raise InputError(
-            f"{where}: names {name[:60]!r}, which is no file inside of {root}, and no picture there has that path's "
+            f"{where}: names {name[:60]!r}, which is no file inside of {root}, and no image there has that path's "
             f"end. {_GIVE}"
         )
     if not any(files):
@@ -94,26 +94,26 @@ def find_pictures(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
 
 
 def count_there(folder: Path, names: Sequence[str]) -> int:
-    """How many names are of pictures in a folder: all as they are written, or else all without their suffixes."""
+    """How many names are of images in a folder: all as they are written, or else all without their suffixes."""
     paths = [path for name in names if (path := path_inside(folder, name)) is not None]
     if count := sum(path.is_file() for path in paths):
         return count
-    stems = {parent: {picture.stem for picture in pictures(parent)} for parent in {path.parent for path in paths}}
+    stems = {parent: {picture.stem for picture in list_images(parent)} for parent in {path.parent for path in paths}}
     return sum(path.stem in stems[path.parent] for path in paths)
 
 
 def _by_tails(
     tails: _Tails, lost: Sequence[tuple[Any, str]], taken: set[Path], named: Sequence[tuple[Any, str]]
 ) -> list[Path | None]:
-    """The picture of each path that is not where it says, if one below the root has its end and no other path.
+    """The image of each path that is not where it says, if one below the root has its end and no other path.
 
     Raises:
-        InputError: for a path that no file has, or that may mean two pictures.
+        InputError: for a path that no file has, or that may mean two images.
     """
     for name, where in lost:
         if not isinstance(name, str) or not _is_possible(tails.root, name):
             raise InputError(
-                f"{where}: names {str(name)[:60]!r}, which is no file inside of {tails.root}; write the picture's path "
+                f"{where}: names {str(name)[:60]!r}, which is no file inside of {tails.root}; write the image's path "
                 "there"
             )
     least = 1 if len({path_parts(name)[:-1] for name, _ in named}) == 1 else 2
@@ -124,12 +124,12 @@ def _by_tails(
 def _is_possible(root: Path, name: str) -> bool:
     """Whether a file may have the name of a path, with a suffix if it lacks one."""
     longest = "/".join(path_parts(name))
-    longest += max(map(len, PICTURES)) * "_" if longest and not _has_suffix(longest) else ""
+    longest += max(map(len, IMAGE_SUFFIXES)) * "_" if longest and not _has_suffix(longest) else ""
     return path_inside(root, longest) is not None
 
 
 def _said(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], moved: Sequence[int]) -> str:
-    """How pictures were found that are not where their names say."""
+    """How images were found that are not where their names say."""
     ways: dict[str, list[int]] = {"by the ends of their paths": [], "by their names without suffix": []}
     for row in moved:
         name = path_parts(named[row][0])[-1]
@@ -152,7 +152,7 @@ def path_parts(name: str) -> Parts:
 
 
 def _there(root: Path, path: Path) -> Path | None:
-    """The picture of a path, by itself, with a suffix, or as a smaller copy; None where there is none."""
+    """The image of a path, by itself, with a suffix, or as a smaller copy; None where there is none."""
     ends = ("", *SMALLER) if path.parent != root else ("",)
     for end in ends:
         parent = path.parent.with_name(path.parent.name + end) if end else path.parent
@@ -163,20 +163,20 @@ def _there(root: Path, path: Path) -> Path | None:
 
 
 def _spelled(name: str) -> Iterator[str]:
-    """A picture's name with the suffixes that it may lack."""
+    """An image's name with the suffixes that it may lack."""
     if _has_suffix(name):
         yield name
     else:
-        spelled = (name + suffix for suffix in (*PICTURES, *map(str.upper, PICTURES)))
+        spelled = (name + suffix for suffix in (*IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)))
         yield from (each for each in spelled if len(each.encode()) <= _LONGEST_NAME)
 
 
 def _has_suffix(name: str) -> bool:
-    return PurePosixPath(name).suffix.lower() in PICTURES
+    return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
 
 
 class _Tails:
-    """The pictures below a folder, which is walked once, when they are asked for."""
+    """The images below a folder, which is walked once, when they are asked for."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -192,12 +192,14 @@ class _Tails:
                 raise InputError(f"{self.root}: has more than {_MOST_FILES} files and folders below. {_GIVE}")
             for name in names:
                 file = Path(folder, name)
-                if file.suffix.lower() in PICTURES and (not file.is_symlink() or file.resolve().is_relative_to(inside)):
+                if file.suffix.lower() in IMAGE_SUFFIXES and (
+                    not file.is_symlink() or file.resolve().is_relative_to(inside)
+                ):
                     known[_folded(file.stem)].append(file.relative_to(self.root).parts)
         return known
 
     def find(self, parts: Parts, least: int, name: str, where: str) -> Path | None:
-        """The picture with the longest common end, of so many parts at least.
+        """The image with the longest common end, of so many parts at least.
 
         Raises:
             InputError: where two have it.

@@ -20,9 +20,9 @@ from mambaloc.data.frames import Split
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import Checked, Matrices, Posed, build_capture, from_quaternions
-from mambaloc.importing.formats.finding import find_pictures
+from mambaloc.importing.formats.finding import find_images
 from mambaloc.importing.formats.kapture_cameras import UNKNOWN, told_cameras
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, pictures_beside, read_text
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, images_in_same_folders, read_text
 from mambaloc.importing.formats.timing import stamps_of
 
 SPLITS: Mapping[str, Split] = {"mapping": "train", "validation": "val", "query": "test"}
@@ -67,7 +67,7 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
         images: the folder that the paths of images are relative to; each kapture's ``records_data`` unless given.
 
     Raises:
-        InputError: for a file that is missing or malformed, or where no picture has a pose.
+        InputError: for a file that is missing or malformed, or where no image has a pose.
     """
     parts = _parts(source)
     if not parts:
@@ -79,7 +79,7 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
     for part, split in parts:
         checked, records = _records(part, split)
         root = images or part / "sensors/records_data"
-        found = find_pictures(root, [(record.name, record.where) for record in records])
+        found = find_images(root, [(record.name, record.where) for record in records])
         sensors = _sensors(part / "sensors/sensors.txt")
         for record, file in sorted(zip(records, found.files, strict=True), key=lambda pair: pair[0].key):
             if file in found.missing:
@@ -99,7 +99,7 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
     names, cameras = told_cameras([lens for _, _, lens in frames])
     times_s = _times_s([str(stamp) for (stamp, _), _, _ in frames])
     if None in names and any(names):
-        choices["cameras"] = f"none: some pictures are of an {UNKNOWN}"
+        choices["cameras"] = f"none: some images are of an {UNKNOWN}"
     return build_capture(
         "kapture",
         source,
@@ -111,7 +111,7 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
         choices={**_CHOICES, **choices},
         cameras=cameras,
         missing=missing,
-        beside=pictures_beside(beside),
+        beside=images_in_same_folders(beside),
     )
 
 

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import pictures, stored_size
+from mambaloc.images import list_images, stored_size
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
     as_numbers,
-    first_with_pictures,
+    first_with_images,
     number_of,
     only_file,
     read_lines,
@@ -53,8 +53,8 @@ def read_kitti(source: Path) -> Capture:
     sequence = _only_sequence(source)
     table = read_table(_poses_file(sequence), 12, _ROW, may_lack_fix=True)
     checked = validate_se3(table.numbers.reshape(-1, 3, 4), table.where)
-    folder = first_with_pictures([sequence / "image_2", sequence / "image_0"])
-    images = pictures(folder)
+    folder = first_with_images([sequence / "image_2", sequence / "image_0"])
+    images = list_images(folder)
     camera, cam0_from_cam = _camera(sequence / "calib.txt", folder.name, images[0])
     world_from_cam = checked @ cam0_from_cam
     times = _times(sequence / "times.txt", len(checked.poses))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
-from mambaloc.images import PICTURES
+from mambaloc.images import IMAGE_SUFFIXES
 from mambaloc.importing.formats.finding import path_parts
 
 _SHOWN = 3  # names in a line
@@ -93,7 +93,7 @@ def _row(parts: tuple[str, ...], rows_of: Mapping[tuple[str, ...], list[int]], n
 
 
 def _parts(name: Any) -> tuple[str, ...]:
-    """A path's parts, without a picture's suffix, as frames may lack it."""
+    """A path's parts, without an image's suffix, as frames may lack it."""
     *folders, file = path_parts(str(name)) or ("",)
     path = PurePosixPath(file)
-    return *folders, path.stem if path.suffix.lower() in PICTURES else file
+    return *folders, path.stem if path.suffix.lower() in IMAGE_SUFFIXES else file

@@ -2,7 +2,7 @@
 
 ``poses.txt`` has lines ``seq1/frame_00012.jpg qw qx qy qz tx ty tz``: world-to-camera, scalar first, in metres, in
 OpenCV's axes. Zeros throughout mark a pose that is kept back, as in the scenes of the test set, and a frame without a
-line was lost. ``intrinsics.txt`` has lines ``seq1/frame_00012.jpg fx fy cx cy width height``, a camera a picture,
+line was lost. ``intrinsics.txt`` has lines ``seq1/frame_00012.jpg fx fy cx cy width height``, a camera an image,
 whose pixels count from the centre of the top-left one, as ``correct_intrinsic_scale`` of the reference loader has it.
 ``poses_device.txt`` are those of the phone's own tracking, in worlds of their own. Source: readme,
 ``lib/datasets/mapfree.py`` and ``utils.py`` of github.com/nianticlabs/map-free-reloc (Arnold et al. 2022).
@@ -18,8 +18,8 @@ import numpy as np
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.arkit import told_apart
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions, pinhole
-from mambaloc.importing.formats.finding import find_pictures
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, pictures_beside, read_lines, read_table
+from mambaloc.importing.formats.finding import find_images
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, images_in_same_folders, read_lines, read_table
 from mambaloc.importing.formats.pose_rows import layout_of
 
 _POSES, _INTRINSICS = "poses.txt", "intrinsics.txt"
@@ -51,15 +51,15 @@ def read_map_free(source: Path, images: Path | None = None) -> Capture:
         images: the folder that holds ``seq0`` and ``seq1``; the scene's own unless given.
 
     Raises:
-        InputError: for a file that is missing or damaged, or where no picture has a pose.
+        InputError: for a file that is missing or damaged, or where no image has a pose.
     """
     table = read_table(source / _POSES, 7, _ROW, named=True, may_lack_fix=True)
     checked = from_quaternions(table.numbers[:, 4:], table.numbers[:, :4], table.where)
     world_from_cam = checked.inverse()
     root = source if images is None else images
-    found = find_pictures(root, [(name, table.where(row)) for row, name in enumerate(table.words)])
+    found = find_images(root, [(name, table.where(row)) for row, name in enumerate(table.words)])
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
-    lenses = cameras_by_picture(source / _INTRINSICS)
+    lenses = cameras_by_image(source / _INTRINSICS)
     has_lens = all(table.words[row] in lenses for row in there)
     names, cameras = told_apart([lenses[table.words[row]] for row in there] if has_lens else [])
     camera_of: Sequence[str | None] = names or [None] * len(there)
@@ -81,18 +81,18 @@ def read_map_free(source: Path, images: Path | None = None) -> Capture:
         choices={
             **_CHOICES,
             **({"not read": ", ".join(unread)} if unread else {}),
-            **({} if has_lens else {"cameras": f"none: {_INTRINSICS} does not name every picture"}),
+            **({} if has_lens else {"cameras": f"none: {_INTRINSICS} does not name every image"}),
             **found.choices,
             **checked.choices,
         },
         cameras=cameras,
         missing=[table.words[row] for row, file in enumerate(found.files) if file in found.missing],
-        beside=pictures_beside(found.files[row] for row in there),
+        beside=images_in_same_folders(found.files[row] for row in there),
     )
 
 
-def cameras_by_picture(path: Path) -> dict[str, Camera]:
-    """Cameras by picture's name, of lines ``name fx fy cx cy width height``; none where there is no such file."""
+def cameras_by_image(path: Path) -> dict[str, Camera]:
+    """Cameras by image's name, of lines ``name fx fy cx cy width height``; none where there is no such file."""
     if not path.is_file():
         return {}
     found = {}

@@ -4,7 +4,7 @@ A chunk has sensors with a calibration in pixels, where cx and cy count from the
 (:mod:`mambaloc.importing.formats.photogrammetric_lens`), and cameras with a transform: 4x4, camera-to-chunk, row after
 row, in OpenCV's axes. The chunk's own transform, or that of the component that a camera is of, has a rotation, a
 translation and a scale, and leads to the world: metres of the local coordinate system, or of geocentric ones where the
-chunk has another. A camera that was not aligned has no transform. Labels are the pictures' names, with or without a
+chunk has another. A camera that was not aligned has no transform. Labels are the images' names, with or without a
 suffix. Source: "Camera models" and ``Chunk.transform`` of Metashape's manual and Python reference; exports that others
 read (``metashape_utils.py`` of nerfstudio, ``derived_cameras.py`` of geograypher, EasyIDP).
 """
@@ -23,8 +23,8 @@ from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
-from mambaloc.importing.formats.finding import find_pictures
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, only_file, pictures_beside, read_xml
+from mambaloc.importing.formats.finding import find_images
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, images_in_same_folders, only_file, read_xml
 from mambaloc.importing.formats.photogrammetric_lens import photogrammetric_lens
 
 _BEGINNING = 4096  # bytes
@@ -46,7 +46,7 @@ def read_metashape(source: Path, images: Path | None = None) -> Capture:
         images: the folder of the images; found below the file's by their names unless given.
 
     Raises:
-        InputError: for a file that is malformed, a camera that cannot be one, or where no picture is there.
+        InputError: for a file that is malformed, a camera that cannot be one, or where no image is there.
     """
     path = only_file(_files(source), source)
     chunk, said = _largest_chunk(path)
@@ -59,7 +59,7 @@ def read_metashape(source: Path, images: Path | None = None) -> Capture:
         said.append(f"{len(aligned) - count} cameras of other components, which were aligned apart")
     labels = [camera.get("label") or "" for camera in cameras]
     folder = images or path.parent
-    found = find_pictures(folder, [(label, f"{path}: camera {label[:60]!r}") for label in labels])
+    found = find_images(folder, [(label, f"{path}: camera {label[:60]!r}") for label in labels])
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     own = next((each for each in chunk.iterfind("components/component") if each.get("id") == component), None)
     transform = None if own is None else own.find("transform")
@@ -95,7 +95,7 @@ def read_metashape(source: Path, images: Path | None = None) -> Capture:
         },
         cameras=lenses,
         missing=[labels[row] for row, file in enumerate(found.files) if file in found.missing],
-        beside=pictures_beside(found.files[row] for row in there),
+        beside=images_in_same_folders(found.files[row] for row in there),
         left_out={found.files[row]: _DISABLED for row in there if row not in set(enabled)},
     )
 

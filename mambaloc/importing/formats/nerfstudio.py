@@ -19,10 +19,10 @@ from mambaloc.data.frames import ROTATION_TOLERANCE
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Capture
 from mambaloc.importing.formats.builder import Matrices, Pose, Posed, build_capture, validate_se3
-from mambaloc.importing.formats.finding import find_pictures
+from mambaloc.importing.formats.finding import find_images
 from mambaloc.importing.formats.listed_splits import given_split
 from mambaloc.importing.formats.nerfstudio_cameras import KEYS, number, read_cameras
-from mambaloc.importing.formats.parsing import pictures_beside, read_object
+from mambaloc.importing.formats.parsing import images_in_same_folders, read_object
 from mambaloc.importing.formats.pose_rows import is_by_column, matrices_of
 from mambaloc.runtime.rotations import is_rotation
 from mambaloc.text import natural
@@ -84,7 +84,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
     frames, exact = _with_exact_rotations(frames)
     given = given_split([frame.name for frame in frames], _lists(contents))
     folder = files[0].parent if images is None else images
-    found = find_pictures(folder, [(frame.name, f"{frame.where}: file_path") for frame in frames])
+    found = find_images(folder, [(frame.name, f"{frame.where}: file_path") for frame in frames])
     if given.split:
         frames = [
             replace(frame, split=given.split.get(row) or frame.split or "unused") for row, frame in enumerate(frames)
@@ -108,7 +108,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         choices={**choices, "cameras": decided, **given.choices, **found.choices, **exact},
         cameras=cameras,
         missing=[image.relative_to(folder).as_posix() for image, _ in pairs if image in found.missing],
-        beside=pictures_beside(image for image, _ in pairs),
+        beside=images_in_same_folders(image for image, _ in pairs),
         split_concern=given.concern,
         left_out={image: _BAD for image, frame in there if frame.is_bad},
     )

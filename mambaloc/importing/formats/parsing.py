@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.files import path_inside, read_json
-from mambaloc.images import PICTURES, holds_pictures, pictures
+from mambaloc.images import IMAGE_SUFFIXES, has_images, list_images
 from mambaloc.text import decode_text
 
 _MOST_BYTES = 1 << 26  # of a text: poses of a million images
@@ -176,22 +176,22 @@ def inside(folder: Path, name: Any, where: str) -> Path:
     return path
 
 
-def pictures_beside(images: Iterable[Path]) -> list[Path]:
-    """All pictures in the folders that images are in, as :func:`pictures`."""
-    return [picture for folder in dict.fromkeys(image.parent for image in images) for picture in pictures(folder)]
+def images_in_same_folders(images: Iterable[Path]) -> list[Path]:
+    """All images in the folders that images are in, as :func:`list_images`."""
+    return [picture for folder in dict.fromkeys(image.parent for image in images) for picture in list_images(folder)]
 
 
-def first_with_pictures(folders: Sequence[Path]) -> Path:
-    """The first of some folders that holds pictures.
+def first_with_images(folders: Sequence[Path]) -> Path:
+    """The first of some folders that holds images.
 
     Raises:
         InputError: where none does.
     """
     for folder in folders:
-        if holds_pictures(folder):
+        if has_images(folder):
             return folder
     names = ", ".join(str(folder) for folder in folders)
-    raise InputError(f"{names}: none holds a picture ({', '.join(PICTURES)}); put the images there")
+    raise InputError(f"{names}: none holds an image ({', '.join(IMAGE_SUFFIXES)}); put the images there")
 
 
 def only_file(found: Iterable[Path], source: Path) -> Path:

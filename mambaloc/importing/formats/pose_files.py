@@ -1,4 +1,4 @@
-"""A file of its own for each picture's pose: beside the picture, or in a folder beside the pictures' folder.
+"""A file of its own for each image's pose: beside the image, or in a folder beside the images' folder.
 
 ``frame-000012.color.png`` with ``frame-000012.pose.txt`` is the layout of 7-Scenes (Shotton et al. 2013), of 12-Scenes
 and of 3RScan: a 4x4 camera-to-world matrix in metres. ``X.jpg`` with ``X.txt``, ``X.pose.txt`` or ``X.npy``, and
@@ -17,7 +17,7 @@ import numpy as np
 
 from mambaloc.data.points.depth import INTRINSICS_FILE, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.errors import InputError
-from mambaloc.images import pictures, stored_size
+from mambaloc.images import list_images, stored_size
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.arkit import told_apart
 from mambaloc.importing.formats.builder import Checked, Matrices, Posed, build_capture, pinhole, validate_se3
@@ -28,7 +28,7 @@ from mambaloc.importing.formats.pose_rows import is_by_column, matrices_of
 from mambaloc.text import natural
 
 _SUFFIXES = (".txt", ".pose", ".npy")
-_OF_PICTURES = ("rgb", "color", "images", "image", "img", "frames")
+_IMAGE_FOLDERS = ("rgb", "color", "images", "image", "img", "frames")
 _OF_POSES = ("poses", "pose", "camera_poses", "cam_poses", "extrinsics")
 _KIND = r"(?:colou?r|rgb|image|img|poses?|camera_pose|cam2world|extrinsics?)"
 _MARKED = re.compile(rf"{_KIND}[._-]?(?=\d)|[._-]{_KIND}$", re.IGNORECASE)
@@ -43,13 +43,13 @@ _TABLE = "Write a table poses.csv with the columns image,x,y,z,qw,qx,qy,qz (came
 
 @dataclass(frozen=True)
 class _Group:
-    """Pictures of one folder with their pose files, in natural order.
+    """Images of one folder with their pose files, in natural order.
 
     Args:
         name: of the sequence.
-        pairs: each picture and its file.
-        poses_alone: files without a picture.
-        beside: all pictures.
+        pairs: each image and its file.
+        poses_alone: files without an image.
+        beside: all images.
     """
 
     name: str
@@ -59,7 +59,7 @@ class _Group:
 
 
 def is_pose_files(source: Path) -> bool:
-    """Whether most pictures of a folder, or of one below it, have a file beside them that holds numbers of a pose."""
+    """Whether most images of a folder, or of one below it, have a file beside them that holds numbers of a pose."""
     group = next(_groups(source), None)
     if group is None:
         return False
@@ -79,7 +79,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
     """
     groups = list(_groups(source))
     if not groups:
-        raise InputError(f"{source}: has no picture with a pose file beside it, as X.jpg with X.txt. {_TABLE}")
+        raise InputError(f"{source}: has no image with a pose file beside it, as X.jpg with X.txt. {_TABLE}")
     files = [file for group in groups for _, file in group.pairs]
     checked, by_column = _read_matrices(files)
     checked = towards_world(checked, direction)
@@ -110,7 +110,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
             "direction": "camera-to-world" if direction == "world_from_cam" else "world-to-camera, inverted",
             "scale": unit,
             "origin": "kept",
-            "association": "each picture with the file of its name",
+            "association": "each image with the file of its name",
             **told,
             **checked.choices,
         },
@@ -122,16 +122,16 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
 
 
 def _groups(source: Path) -> Iterator[_Group]:
-    """Folders at a source, or below it, in which at least half of the pictures have pose files."""
+    """Folders at a source, or below it, in which at least half of the images have pose files."""
     for folder in _folders(source):
-        own = [image for image in pictures(folder) if not _OTHER.search(image.name)]
+        own = [image for image in list_images(folder) if not _OTHER.search(image.name)]
         if own and (group := _paired(folder, _name(folder, source), own, _pose_files(folder))):
             yield group
             continue
-        images = next((folder / name for name in _OF_PICTURES if (folder / name).is_dir()), None)
+        images = next((folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()), None)
         poses = next((folder / name for name in _OF_POSES if (folder / name).is_dir()), None)
         if images is not None and poses is not None:
-            group = _paired(folder, _name(folder, source), pictures(images), _pose_files(poses))
+            group = _paired(folder, _name(folder, source), list_images(images), _pose_files(poses))
             if group:
                 yield group
 
@@ -157,7 +157,7 @@ def _pose_files(folder: Path) -> list[Path]:
 
 
 def _paired(folder: Path, name: str, images: list[Path], files: list[Path]) -> _Group | None:
-    """Pictures and files of one name, or else of one number."""
+    """Images and files of one name, or else of one number."""
     for key in (_key, number_of):
         by_key: dict[str | int, Path] = {}
         for file in files:
@@ -172,7 +172,7 @@ def _paired(folder: Path, name: str, images: list[Path], files: list[Path]) -> _
 
 
 def _key(path: Path) -> str:
-    """What a picture and its pose file are both called: ``frame-000012`` of both ``.color.png`` and ``.pose.txt``."""
+    """What an image and its pose file are both called: ``frame-000012`` of both ``.color.png`` and ``.pose.txt``."""
     return _MARKED.sub("", path.stem).lower()
 
 
@@ -238,7 +238,7 @@ def _cameras(source: Path, images: list[Path], is_layout: bool) -> tuple[Sequenc
 
 
 def _official_camera(image: Path) -> Camera | None:
-    """The colour camera of 7-Scenes, where a picture has its size."""
+    """The colour camera of 7-Scenes, where an image has its size."""
     width, height = stored_size(image)
     if (width, height) != _OFFICIAL_SIZE:
         return None

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import pictures, stored_size
+from mambaloc.images import list_images, stored_size
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.parsing import (
@@ -51,7 +51,7 @@ def read_scannet(source: Path) -> Capture:
         InputError: for a file that is missing or damaged.
     """
     folder = _scannet_folder(source) or source
-    images = {image.stem: image for image in pictures(folder / "color")}
+    images = {image.stem: image for image in list_images(folder / "color")}
     files = sorted((folder / "pose").glob("*.txt"), key=natural) if (folder / "pose").is_dir() else []
     if not images or not files:
         raise InputError(
@@ -99,7 +99,7 @@ def read_replica(source: Path) -> Capture:
     """
     table = read_table(source / "traj.txt", 16, _MATRIX, may_lack_fix=True)
     checked = validate_se3(table.numbers.reshape(-1, 4, 4), table.where)
-    images = [image for image in pictures(source / "results") if image.name.startswith("frame")]
+    images = [image for image in list_images(source / "results") if image.name.startswith("frame")]
     numbered = {number_of(image): image for image in images}
     camera = _replica_camera(source)
     name = folder_name(source)

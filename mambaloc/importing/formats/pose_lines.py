@@ -1,6 +1,6 @@
-"""Files of a pose a line that are neither KITTI's nor TUM's, beside their pictures.
+"""Files of a pose a line that are neither KITTI's nor TUM's, beside their images.
 
-Sixteen numbers are a 4x4 matrix, camera-to-world; lines without a name are those of the pictures in natural order. A
+Sixteen numbers are a 4x4 matrix, camera-to-world; lines without a name are those of the images in natural order. A
 name may stand before twelve or sixteen numbers, or before seven: ``name qw qx qy qz tx ty tz`` is **world-to-camera**,
 scalar first, as in COLMAP's ``images.txt`` and hloc's results; with the position first, a line that names the columns
 must say where the scalar is, and poses are camera-to-world. ``intrinsics.txt`` with lines ``name fx fy cx cy width
@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import PICTURES, pictures
+from mambaloc.images import IMAGE_SUFFIXES, list_images
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import (
     Checked,
@@ -26,9 +26,9 @@ from mambaloc.importing.formats.builder import (
     validate_se3,
 )
 from mambaloc.importing.formats.column_names import scale_of
-from mambaloc.importing.formats.finding import count_there, find_pictures
-from mambaloc.importing.formats.map_free import cameras_by_picture
-from mambaloc.importing.formats.parsing import Table, first_with_pictures, folder_name, only_file, pictures_beside
+from mambaloc.importing.formats.finding import count_there, find_images
+from mambaloc.importing.formats.map_free import cameras_by_image
+from mambaloc.importing.formats.parsing import Table, first_with_images, folder_name, images_in_same_folders, only_file
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS, Layout, layout_of, matrices_of, pose_files, read_rows
 from mambaloc.importing.formats.timing import pair
 
@@ -54,7 +54,7 @@ def read_pose_lines(source: Path, direction: Direction | None = None, images: Pa
         images: the folder of the images; found beside the file unless given.
 
     Raises:
-        InputError: for a file that is damaged, can be read in more ways than one, or does not fit its pictures.
+        InputError: for a file that is damaged, can be read in more ways than one, or does not fit its images.
     """
     found = _files(source)
     if not found:
@@ -77,7 +77,7 @@ def read_in_order(
     direction: Direction = "world_from_cam",
     given: Path | None = None,
 ) -> Capture:
-    """Read matrices without names, which are those of the pictures beside their file, in natural order.
+    """Read matrices without names, which are those of the images beside their file, in natural order.
 
     Args:
         path: the file.
@@ -88,15 +88,15 @@ def read_in_order(
         given: the folder of the images; found beside the file unless given.
 
     Raises:
-        InputError: for a file that is damaged, or another number of pictures.
+        InputError: for a file that is damaged, or another number of images.
     """
     table = read_rows(path, layout, " ".join(["number"] * layout.count))
-    folder = first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS])
-    images = pictures(folder)
+    folder = first_with_images([given] if given else [path.parent / name for name in IMAGE_FOLDERS])
+    images = list_images(folder)
     if len(images) != len(table.lines):
         raise InputError(
             f"{path}: has {len(table.lines)} poses, and {folder} {len(images)} images; give as many, in the same "
-            "order, or write each picture's name before its pose"
+            "order, or write each image's name before its pose"
         )
     checked = validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
     checked = towards_world(checked, direction)
@@ -133,8 +133,8 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None, given: 
         told = {"direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD}
         told |= _by_column(layout)
     checked = towards_world(checked, direction)
-    rows, how, missing = _pictures_of(path, table, given)
-    cameras = cameras_by_picture(path.parent / "intrinsics.txt")
+    rows, how, missing = _images_of(path, table, given)
+    cameras = cameras_by_image(path.parent / "intrinsics.txt")
     names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras.values()))}
     camera_of = {name: names[camera] for name, camera in cameras.items()}
     posed = [
@@ -163,7 +163,7 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None, given: 
         metres_per_unit=length_m,
         cameras={name: camera for camera, name in names.items()},
         missing=missing,
-        beside=pictures_beside(image for image, _, _ in rows),
+        beside=images_in_same_folders(image for image, _, _ in rows),
     )
 
 
@@ -193,20 +193,20 @@ def towards_world(checked: Checked, direction: Direction) -> Checked:
     return checked if direction == "world_from_cam" else checked.inverse()
 
 
-def _pictures_of(
+def _images_of(
     path: Path, table: Table, given: Path | None
 ) -> tuple[list[tuple[Path, int, float | None]], str, list[str]]:
-    """Each picture with its row and time, how they were associated, and the names whose pictures are not there."""
+    """Each image with its row and time, how they were associated, and the names whose images are not there."""
     folders = [given] if given else [path.parent, *(path.parent / name for name in IMAGE_FOLDERS[:-1])]
-    if all(PurePosixPath(word).suffix.lower() in PICTURES for word in table.words):
+    if all(PurePosixPath(word).suffix.lower() in IMAGE_SUFFIXES for word in table.words):
         folder = max(folders, key=lambda each: count_there(each, table.words))
-        found = find_pictures(folder, [(word, table.where(row)) for row, word in enumerate(table.words)])
+        found = find_images(folder, [(word, table.where(row)) for row, word in enumerate(table.words)])
         missing = [word for word, file in zip(table.words, found.files, strict=True) if file in found.missing]
         frames: list[tuple[Path, int, float | None]] = [
             (file, row, None) for row, file in enumerate(found.files) if file not in found.missing
         ]
         return frames, "; ".join(filter(None, ("by name", found.elsewhere))), missing
-    images = pictures(first_with_pictures([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
+    images = list_images(first_with_images([given] if given else [path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, table.words, path)
     return pairing.frames, pairing.how, pairing.missing
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import PICTURES, pictures
+from mambaloc.images import IMAGE_SUFFIXES, list_images
 from mambaloc.importing.formats.builder import LONGEST, SHORTEST, Matrices, is_mark
 from mambaloc.importing.formats.column_names import Column, columns_in, metres_per_unit
 from mambaloc.importing.formats.parsing import Table, as_numbers, read_text
@@ -23,15 +23,15 @@ from mambaloc.runtime.rotations import is_rotation
 
 SUFFIXES = ("", ".txt", ".tum", ".kitti", ".log", ".dat", ".tsv")
 IMAGE_FOLDERS = ("rgb", "color", "image_2", "image_0", "images", "image", "frames", "results", "data", ".")
-"""Where pictures lie beside a file of poses."""
+"""Where images lie beside a file of poses."""
 _LOOKED_AT = 200  # lines
 _LEAST_LINES = 2  # one may be a camera's place on its rig
-_MOST_FILES = 64  # of a folder: more are labels of pictures
+_MOST_FILES = 64  # of a folder: more are labels of images
 _NEARLY_ALL = 0.9  # of the lines: others may be damaged, and are refused by their line
 _MOST = 0.8
 _TOLERANCE = 0.02  # of lengths and of entries of R R^T
 _HEADERS = 3
-_AFTER_PICTURE = re.compile(rf"(.*?(?:{'|'.join(map(re.escape, PICTURES))}))[\s,;]+(.+)", re.IGNORECASE)
+_AFTER_IMAGE = re.compile(rf"(.*?(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))}))[\s,;]+(.+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,9 @@ class Layout:
 
 
 def split_line(line: str) -> tuple[str, list[str]]:
-    """A line's leading word, and the words after it; a picture's name may hold spaces, and be in quotes."""
+    """A line's leading word, and the words after it; an image's name may hold spaces, and be in quotes."""
     line = line.replace('"', "")
-    named = _AFTER_PICTURE.fullmatch(line.strip())
+    named = _AFTER_IMAGE.fullmatch(line.strip())
     if named:
         return named[1], re.split(r"[\s,;]+", named[2].strip(" \t,;"))
     words = re.split(r"[\s,;]+", line.strip(" \t,;"))
@@ -182,10 +182,10 @@ def matrices_of(table: Matrices, by_column: bool) -> Matrices:
 
 
 def pose_files(folder: Path) -> dict[Path, Layout]:
-    """The files of a folder whose lines are poses; none that has a picture's name, which it labels."""
+    """The files of a folder whose lines are poses; none that has an image's name, which it labels."""
     if not folder.is_dir():
         return {}
-    pictured = {picture.name.partition(".")[0] for picture in pictures(folder)}
+    pictured = {picture.name.partition(".")[0] for picture in list_images(folder)}
     texts = [
         path
         for path in sorted(folder.iterdir())

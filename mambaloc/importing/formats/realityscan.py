@@ -1,9 +1,9 @@
 """Cameras that RealityScan and RealityCapture export as CSV ("Internal/External camera parameters").
 
 A line names the columns ``#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2``, or, in newer versions, ``yaw``,
-``f_35mm``, ``px_norm`` and ``py_norm``; a row is a picture. Position is the camera's centre. Angles are in degrees:
+``f_35mm``, ``px_norm`` and ``py_norm``; a row is an image. Position is the camera's centre. Angles are in degrees:
 ``world_from_cam = Rz(-heading) Rx(pitch) Ry(roll)`` in OpenGL's camera axes, so that zeros look down with north up. The
-focal length is for a picture 36 mm long, the principal point a share of the longer side from the picture's middle,
+focal length is for an image 36 mm long, the principal point a share of the longer side from the image's middle,
 right and down. The lens is that of :mod:`mambaloc.importing.formats.photogrammetric_lens`, with t1 and t2 as p1 and p2.
 The world is that which was asked for in the export, and its unit is not in the file. Source: the export formats that
 ship with RealityScan 2.2 (``calibration.xml``: ``$(f*36)``, ``$(px*scale+width*0.5)``, OpenCV's p1 and p2 as t2 and t1)
@@ -26,8 +26,8 @@ from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, stored_size
 from mambaloc.importing.capture import OPENCV_FROM_OPENGL, Camera, Capture
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, pinhole, validate_se3
-from mambaloc.importing.formats.finding import find_pictures
-from mambaloc.importing.formats.parsing import as_numbers, folder_name, only_file, pictures_beside, read_text
+from mambaloc.importing.formats.finding import find_images
+from mambaloc.importing.formats.parsing import as_numbers, folder_name, images_in_same_folders, only_file, read_text
 from mambaloc.importing.formats.photogrammetric_lens import photogrammetric_lens
 from mambaloc.runtime.rotations import rigid_transforms
 from mambaloc.text import natural, open_text
@@ -47,7 +47,7 @@ _CHOICES = {
 }
 
 Row = tuple[int, str, Matrices]
-"""A line's number, the picture's name, and numbers by :data:`_POSE` and :data:`_LENS`."""
+"""A line's number, the image's name, and numbers by :data:`_POSE` and :data:`_LENS`."""
 
 
 def is_realityscan(source: Path) -> bool:
@@ -56,19 +56,19 @@ def is_realityscan(source: Path) -> bool:
 
 
 def read_realityscan(source: Path, images: Path | None = None) -> Capture:
-    """Read a table; pictures with the same numbers have one camera.
+    """Read a table; images with the same numbers have one camera.
 
     Args:
         source: the table, or its folder.
         images: the folder of the images; found below the table's by their names unless given.
 
     Raises:
-        InputError: for a table that is malformed, a camera that cannot be one, or where no picture is there.
+        InputError: for a table that is malformed, a camera that cannot be one, or where no image is there.
     """
     path = only_file(_files(source), source)
     rows = _rows(path)
     folder = images or path.parent
-    found = find_pictures(folder, [(name, f"{path}, line {line}") for line, name, _ in rows])
+    found = find_images(folder, [(name, f"{path}, line {line}") for line, name, _ in rows])
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     table = np.array([numbers for _, _, numbers in rows])
     checked = validate_se3(_world_from_cam(table), lambda row: f"{path}, line {rows[row][0]}")
@@ -89,7 +89,7 @@ def read_realityscan(source: Path, images: Path | None = None) -> Capture:
         choices={**_CHOICES, **found.choices},
         cameras=cameras,
         missing=[rows[row][1] for row, file in enumerate(found.files) if file in found.missing],
-        beside=pictures_beside(found.files[row] for row in there),
+        beside=images_in_same_folders(found.files[row] for row in there),
     )
 
 
@@ -134,7 +134,7 @@ def _rows(path: Path) -> list[Row]:
             raise InputError(f"{path}, line {number}: is no row of a name and numbers; correct or remove it")
         rows.append((number, row["name"], numbers))
     if not rows:
-        raise InputError(f"{path}: has no row below its columns' names; align the pictures, and export again")
+        raise InputError(f"{path}: has no row below its columns' names; align the images, and export again")
     return rows
 
 

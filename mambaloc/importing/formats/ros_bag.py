@@ -1,8 +1,8 @@
 """Robots' recordings: ROS 1 bags (``.bag``) and ROS 2 bags (a folder, ``.mcap`` or ``.db3``), read by rosbags.
 
-A picture's time and its camera's optical frame are those of its message's header. That frame has OpenCV's axes, z
+An image's time and its camera's optical frame are those of its message's header. That frame has OpenCV's axes, z
 forward, x right and y down (REP 103). It is placed by a topic of poses or by ``/tf``, whose transforms are
-interpolated at the picture's time; ``/tf_static`` links the robot to the camera.
+interpolated at the image's time; ``/tf_static`` links the robot to the camera.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from mambaloc.bags.pictures import BagCamera, Picture, camera_of, picture_topic, pictures_of
+from mambaloc.bags.images import BagCamera, BagImage, camera_of, image_topic, images_of
 from mambaloc.bags.poses import Gaps, pose_source
 from mambaloc.bags.reading import Bag, frame_name, open_bag
 from mambaloc.bags.transforms import Gap, along
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import Image
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.film import digest_of
 from mambaloc.importing.formats.builder import Pose, Posed, build_capture, pinhole
 from mambaloc.importing.formats.parsing import folder_name
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.importing.undistort.fitting import FittedCameras
+from mambaloc.importing.video import digest_of
 from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 from mambaloc.runtime.sources import SourceFrame
 from mambaloc.runtime.undistortion import undistorted
@@ -53,7 +53,7 @@ class BagTopics:
     """What to read of a bag that has several.
 
     Args:
-        pictures: the topic of pictures.
+        images: the topic of images.
         poses: the topic of poses, or ``/tf``.
         pose_frame: the frame that the poses are of, where their messages do not say it.
     """
@@ -64,7 +64,7 @@ class BagTopics:
 
 
 def read_ros_bag(source: Path, topics: BagTopics | None = None) -> Capture:
-    """Choose pictures that have a pose for sharpness and movement; they are kept in the user's cache.
+    """Choose images that have a pose for sharpness and movement; they are kept in the user's cache.
 
     Args:
         source: as :func:`~mambaloc.bags.reading.is_bag` takes it.
@@ -76,7 +76,7 @@ def read_ros_bag(source: Path, topics: BagTopics | None = None) -> Capture:
     """
     asked = topics or BagTopics()
     with open_bag(source) as bag:
-        topic = picture_topic(bag, asked.pictures)
+        topic = image_topic(bag, asked.pictures)
         told = camera_of(bag, topic)
         digest = digest_of(_files(source), _VERSION, topic, asked.poses, asked.pose_frame)
         folder = made_once(f"bags/{digest}", lambda partial: _write_chosen(bag, topic, asked, partial))
@@ -134,17 +134,17 @@ def camera_from(told: BagCamera, where: str) -> Camera:
 
 
 def straightener(told: BagCamera, size: tuple[int, int]) -> tuple[NDArray[np.float64], Callable[[Image], Image]]:
-    """Intrinsics (3, 3) of a bag's pictures of a size as an import writes them, and what makes a picture so.
+    """Intrinsics (3, 3) of a bag's images of a size as an import writes them, and what makes an image so.
 
     Raises:
-        InputError: for pictures of another shape than the camera's, or as :func:`camera_from`.
+        InputError: for images of another shape than the camera's, or as :func:`camera_from`.
     """
     name = "CameraInfo"
     cameras = FittedCameras({name: camera_from(told, name)})
     fit = cameras.fitted(name, size)
     if fit is None:
         shapes = " and ".join("{}x{}".format(*each) for each in (size, told.size))
-        raise InputError(f"{name}: pictures and camera have other shapes ({shapes}). Give these with --intrinsics.")
+        raise InputError(f"{name}: images and camera have other shapes ({shapes}). Give these with --intrinsics.")
     used, maps = cameras.as_used([name], [size], {size: size})[1][name], fit[1]
 
     def straighten(image: Image) -> Image:
@@ -159,12 +159,12 @@ def _files(source: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class _PosedFrame(SourceFrame):
-    picture: Picture
+    picture: BagImage
     pose: NDArray[np.float64]
 
 
 def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
-    """Write chosen pictures as they were recorded, raw ones as PNG, beside their poses and a note."""
+    """Write chosen images as they were recorded, raw ones as PNG, beside their poses and a note."""
     camera = frame_name(bag.first(topic).header.frame_id)
     source = pose_source(bag, camera, asked.poses, asked.pose_frame)
     gaps, damaged = Gaps(), dict[str, str]()
@@ -172,7 +172,7 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
     def with_pose() -> Iterator[_PosedFrame]:
         seen = set()
         count, console = bag.counts[topic], Console(stderr=True)
-        for picture in track(pictures_of(bag, topic), "Choosing frames", count, console=console, transient=True):
+        for picture in track(images_of(bag, topic), "Choosing frames", count, console=console, transient=True):
             pose = along(source.path, picture.ns)
             if isinstance(pose, Gap):
                 gaps.add(pose)
@@ -192,7 +192,7 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
         poses.append(frame.pose)
     if not frames:
         raise InputError(
-            f"{bag.path}: no picture of {topic} has a pose; {str(gaps) or 'none is whole'}. Record both at once."
+            f"{bag.path}: no image of {topic} has a pose; {str(gaps) or 'none is whole'}. Record both at once."
         )
     np.save(folder / _POSES, np.array(poses))
     note = {
@@ -208,8 +208,8 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
     (folder / _NOTE).write_text(json.dumps(note), encoding="utf-8")
 
 
-def _file_of(picture: Picture) -> tuple[bytes, str]:
-    """The picture's file as it was recorded, or a PNG, and its suffix."""
+def _file_of(picture: BagImage) -> tuple[bytes, str]:
+    """The image's file as it was recorded, or a PNG, and its suffix."""
     for start, suffix in ((b"\xff\xd8", ".jpg"), (b"\x89PNG", ".png")):
         if picture.file is not None and picture.file.startswith(start):
             return picture.file, suffix

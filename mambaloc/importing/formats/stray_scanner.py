@@ -1,7 +1,7 @@
-"""Recordings of Stray Scanner, an app for phones with LiDAR: a film, and ARKit's pose of each of its frames.
+"""Recordings of Stray Scanner, an app for phones with LiDAR: a video, and ARKit's pose of each of its frames.
 
 ``odometry.csv`` has a header and a row a frame, ``timestamp, frame, x, y, z, qx, qy, qz, qw`` in seconds and metres,
-and in newer versions ``fx, fy, cx, cy``. ``camera_matrix.csv`` is K, 3x3, of the film's frames. ``rgb.mp4`` is the
+and in newer versions ``fx, fy, cx, cy``. ``camera_matrix.csv`` is K, 3x3, of the video's frames. ``rgb.mp4`` is the
 film, ``depth/NNNNNN.png`` a frame's depth in millimetres of 16 bits, with the same field of view, and
 ``confidence/NNNNNN.png`` how sure ARKit is of each of its pixels: 0, 1 or 2. Source:
 ``docs/format.md`` of github.com/strayrobots/scanner. The app turns ARKit's camera axes to OpenCV's before it writes a
@@ -21,10 +21,10 @@ from mambaloc.data.points.depth import read_depth_mm
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, stored_size
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.film import chosen_as_stored
 from mambaloc.importing.formats.arkit import told_apart
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole
 from mambaloc.importing.formats.parsing import Table, as_numbers, folder_name, read_text
+from mambaloc.importing.video import chosen_as_stored
 
 _FILM, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -44,10 +44,10 @@ def is_stray_scanner(source: Path) -> bool:
 
 
 def read_stray_scanner(source: Path) -> Capture:
-    """Read poses, and choose frames of the film for sharpness and movement, which are kept in the user's cache.
+    """Read poses, and choose frames of the video for sharpness and movement, which are kept in the user's cache.
 
     Raises:
-        InputError: for a file that is missing or damaged, or a film of which no frame has a pose.
+        InputError: for a file that is missing or damaged, or a video of which no frame has a pose.
     """
     table = _odometry(source / _ODOMETRY)
     numbers = [_frame_number(table, row) for row in range(len(table.lines))]
@@ -58,7 +58,7 @@ def read_stray_scanner(source: Path) -> Capture:
     if not present:
         raise InputError(
             f"{source / _ODOMETRY}: has no pose of a frame that was chosen of {_FILM}, which has {film.read} frames. "
-            "Give the film and the poses of one recording."
+            "Give the video and the poses of one recording."
         )
     images = [film.images[numbers[row]] for row in present]
     size = stored_size(images[0])
@@ -160,7 +160,7 @@ def _camera(table: Table, row: int, size: tuple[int, int], matrix: Matrices, sou
 
 
 def _depth_camera(files: Sequence[Path], size: tuple[int, int], matrix: Matrices) -> Matrices | None:
-    """K of depth frames, which see what the film's frames see; None where there is none."""
+    """K of depth frames, which see what the video's frames see; None where there is none."""
     if not files:
         return None
     height, width = read_depth_mm(files[0]).shape

@@ -32,7 +32,7 @@ class TableColumns:
 
     Args:
         names: of all columns, in order.
-        image: of a picture's file, where there is one.
+        image: of an image's file, where there is one.
         position: three.
         quaternion: four, scalar first.
         sequence: of a recording, where there is one.

@@ -1,4 +1,4 @@
-"""Which pose is which picture's, where both are named by numbers: by equal names, or by the nearest time stamps.
+"""Which pose is which image's, where both are named by numbers: by equal names, or by the nearest time stamps.
 
 Time stamps are compared as whole nanoseconds: float64 is off by 128 of them at today's times. Their unit is found by
 their size. Times since 1970 are of one size in each unit, so that a file may mix units; of others the median step
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.images import PICTURES
+from mambaloc.images import IMAGE_SUFFIXES
 
 FARTHEST_S = 0.02
 """Time stamps that differ by more are not associated: the default of TUM's ``associate.py``."""
@@ -122,15 +122,15 @@ def _overlap(some: NDArray[np.int64], others: NDArray[np.int64]) -> float:
     return shared / max(max(int(some.max()), int(others.max())) - min(int(some.min()), int(others.min())), 1)
 
 
-def picture_words(images: Sequence[Path]) -> list[str]:
-    """The number that each picture is named by, as ``1.5`` of ``cam_1.5.png``; the stem where it has no single one."""
+def image_words(images: Sequence[Path]) -> list[str]:
+    """The number that each image is named by, as ``1.5`` of ``cam_1.5.png``; the stem where it has no single one."""
     found = [_NUMBER.fullmatch(image.stem) for image in images]
     return [image.stem if match is None else match[1] for image, match in zip(images, found, strict=True)]
 
 
-def picture_stamps(images: Sequence[Path]) -> Stamps | None:
-    """Times that pictures are named by, if they are; small whole numbers could as well count frames."""
-    words = picture_words(images)
+def image_stamps(images: Sequence[Path]) -> Stamps | None:
+    """Times that images are named by, if they are; small whole numbers could as well count frames."""
+    words = image_words(images)
     stamps = stamps_of(words)
     if stamps is None or all("." in word for word in words):
         return stamps
@@ -142,12 +142,12 @@ def picture_stamps(images: Sequence[Path]) -> Stamps | None:
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which pose is which picture's.
+    """Which pose is which image's.
 
     Args:
-        frames: each picture that has a pose, the row of that, and the picture's time; None where names are no times.
+        frames: each image that has a pose, the row of that, and the image's time; None where names are no times.
         how: it was found, for ``choices``.
-        missing: names of poses whose picture is not there.
+        missing: names of poses whose image is not there.
     """
 
     frames: list[tuple[Path, int, float | None]]
@@ -156,7 +156,7 @@ class Pairing:
 
 
 def pair(images: Sequence[Path], words: Sequence[str], listing: Path) -> Pairing:
-    """Pair pictures with poses whose lines begin with words, by name, or else by time.
+    """Pair images with poses whose lines begin with words, by name, or else by time.
 
     Args:
         images: some.
@@ -164,20 +164,20 @@ def pair(images: Sequence[Path], words: Sequence[str], listing: Path) -> Pairing
         listing: the file of the poses, for messages.
 
     Raises:
-        InputError: where names do not tell which pose is which picture's.
+        InputError: where names do not tell which pose is which image's.
     """
-    named, stamps = _by_name(images, words), picture_stamps(images)
+    named, stamps = _by_name(images, words), image_stamps(images)
     if named is not None:
         pairs, how, missing = named
         return Pairing(_frames(images, stamps, pairs), how, missing)
     if stamps is None:
         raise InputError(
             f"{listing}: does not tell which pose is which image's: {images[0].name!r} is neither a time stamp such "
-            f"as 1305031102.175304.png, nor in its first column. Write the pictures' names into its first column, or "
+            f"as 1305031102.175304.png, nor in its first column. Write the images' names into its first column, or "
             f"lines 'timestamp file' to {listing.with_name('rgb.txt')} and call the trajectory groundtruth.txt."
         )
     pairs, how = by_time(images[0].parent, stamps, words, listing)
-    return Pairing(_frames(images, stamps, pairs), f"{how}; pictures are named in {stamps.unit}", [])
+    return Pairing(_frames(images, stamps, pairs), f"{how}; images are named in {stamps.unit}", [])
 
 
 def _frames(
@@ -188,10 +188,10 @@ def _frames(
 
 
 def by_time(named: Path, stamps: Stamps, words: Sequence[str], listing: Path) -> tuple[list[tuple[int, int]], str]:
-    """Pair pictures' times with those of poses, and say how.
+    """Pair images' times with those of poses, and say how.
 
     Args:
-        named: what says the pictures' times, for messages.
+        named: what says the images' times, for messages.
         stamps: theirs.
         words: a pose's time each.
         listing: the file of the poses, for messages.
@@ -206,7 +206,7 @@ def by_time(named: Path, stamps: Stamps, words: Sequence[str], listing: Path) ->
     if not pairs:
         raise InputError(
             f"{listing}: none of {len(words)} poses ({poses.span}) is within {FARTHEST_S} s of an image of {named} "
-            f"({stamps.span}). Give pictures and poses of one recording, by one clock."
+            f"({stamps.span}). Give images and poses of one recording, by one clock."
         )
     return pairs, f"nearest time stamps, within {FARTHEST_S} s; poses are timed in {poses.unit}"
 
@@ -236,7 +236,7 @@ def _by_name(images: Sequence[Path], words: Sequence[str]) -> tuple[list[tuple[i
     rows = {_plain(word): row for row, word in enumerate(words)}
     names = [_plain(image.name) for image in images]
     if all(word.isdecimal() for word in words):  # then frame_0012.jpg is 12's
-        numbers = map(_plain, picture_words(images))
+        numbers = map(_plain, image_words(images))
         names = [name if name in rows else number for name, number in zip(names, numbers, strict=True)]
     found = [(i, rows[name]) for i, name in enumerate(names) if name in rows]
     if len(found) not in (len(images), len(words)) or len({row for _, row in found}) < len(found):
@@ -249,7 +249,7 @@ def _plain(name: str) -> str:
     """An image's name without folder and suffix, or the number that it is, however it is written."""
     file = name.rpartition("/")[2]
     before, dot, suffix = file.rpartition(".")
-    stem = before if dot + suffix.lower() in PICTURES else file
+    stem = before if dot + suffix.lower() in IMAGE_SUFFIXES else file
     if not stem[:1].isdigit():
         return stem
     number = _number(stem)

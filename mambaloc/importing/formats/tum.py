@@ -15,17 +15,17 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.images import pictures
+from mambaloc.images import list_images
 from mambaloc.importing.capture import Capture, Unit
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions
 from mambaloc.importing.formats.column_names import scale_of
-from mambaloc.importing.formats.finding import find_pictures
+from mambaloc.importing.formats.finding import find_images
 from mambaloc.importing.formats.parsing import (
     Table,
-    first_with_pictures,
+    first_with_images,
     folder_name,
+    images_in_same_folders,
     only_file,
-    pictures_beside,
     read_lines,
 )
 from mambaloc.importing.formats.pose_rows import IMAGE_FOLDERS, Layout, layout_of, pose_files, read_rows
@@ -59,7 +59,7 @@ def read_tum_rgbd(source: Path, images: Path | None = None) -> Capture:
         words_of.append(words[0])
     if not named:
         raise InputError(f"{listing}: names no image; add lines 'timestamp file'")
-    found = find_pictures(images or source, named)
+    found = find_images(images or source, named)
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     stamps = stamps_of([words_of[row] for row in there])
     if stamps is None:
@@ -67,7 +67,7 @@ def read_tum_rgbd(source: Path, images: Path | None = None) -> Capture:
     pairs, how = by_time(listing, stamps, table.words, table.path)
     how = "; ".join(filter(None, (how, found.elsewhere)))
     missing = [name for (name, _), file in zip(named, found.files, strict=True) if file in found.missing]
-    beside = pictures_beside(found.files[row] for row in there)
+    beside = images_in_same_folders(found.files[row] for row in there)
     rows = [(found.files[there[i]], j, float(stamps.seconds[i])) for i, j in pairs]
     return _capture("tum_rgbd", source, (table, layout), rows, how, missing, beside)
 
@@ -85,7 +85,7 @@ def read_tum(source: Path) -> Capture:
     """
     path = only_file(_trajectories(source), source)
     table, layout = _read_trajectory(path)
-    images = pictures(first_with_pictures([path.parent / name for name in IMAGE_FOLDERS]))
+    images = list_images(first_with_images([path.parent / name for name in IMAGE_FOLDERS]))
     pairing = pair(images, table.words, table.path)
     return _capture("tum", path.parent, (table, layout), pairing.frames, pairing.how, pairing.missing, images)
 

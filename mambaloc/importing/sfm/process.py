@@ -80,7 +80,7 @@ def reconstruct(job: Job, source: Path, remedy: str, progress: Progress) -> int:
             reason = ", ".join([_ending(process.returncode), *_last_words(log)])
             raise InputError(
                 f"{source}: the process of COLMAP ended at {step!r} ({reason}). Try again with more memory free, or "
-                "pose the pictures with another tool and import what it exports."
+                "pose the images with another tool and import what it exports."
             )
     return int(placed)
 

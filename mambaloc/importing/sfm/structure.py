@@ -1,8 +1,8 @@
-"""Pictures without poses, a film or a folder of photographs: posed by structure from motion.
+"""Images without poses, a video or a folder of photographs: posed by structure from motion.
 
-Frames of a film are chosen for sharpness and movement, and matched with their neighbours; of a few photographs every
-pair is. All pictures of one size share a camera with a radial distortion. The scale is arbitrary. What was made is kept
-in the user's cache and found again, unless the pictures change.
+Frames of a video are chosen for sharpness and movement, and matched with their neighbours; of a few photographs every
+pair is. All images of one size share a camera with a radial distortion. The scale is arbitrary. What was made is kept
+in the user's cache and found again, unless the images change.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 from mambaloc.data.colmap import import_pycolmap
 from mambaloc.errors import InputError
-from mambaloc.images import Counts, pictures, read_image
+from mambaloc.images import Counts, list_images, read_image
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.film import FILMS, Counted, digest_of, write_frames
 from mambaloc.importing.formats.colmap import read_colmap
-from mambaloc.importing.formats.parsing import first_with_pictures, folder_name
+from mambaloc.importing.formats.parsing import first_with_images, folder_name
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.importing.sfm.process import Job, reconstruct
 from mambaloc.importing.sfm.unread import pose_like, warning_of
 from mambaloc.importing.undistort.decoding import choices_of, counts_of
+from mambaloc.importing.video import VIDEO_SUFFIXES, Counted, digest_of, write_frames
 from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
 from mambaloc.user_cache import made_once
 
-_NEIGHBOURS = 10  # before and after a film's frame that it is matched with, beside those 2, 4, 8, ... apart
+_NEIGHBOURS = 10  # before and after a video's frame that it is matched with, beside those 2, 4, 8, ... apart
 _VERSION = 1  # of what is kept: another one is made anew
-_MOST_PHOTOGRAPHS = 60  # every pair of so many is matched; a folder of more is taken for a film's frames
-_MOST_FRAMES = 400  # of a film: placing a hundred takes minutes
+_MOST_PHOTOGRAPHS = 60  # every pair of so many is matched; a folder of more is taken for a video's frames
+_MOST_FRAMES = 400  # of a video: placing a hundred takes minutes
 _FEWEST_FRAMES = 5
 _LEAST_PLACED = 0.5
 _ADVICE = (
@@ -42,18 +42,18 @@ _ADVICE = (
 )
 
 
-def is_pictures(source: Path) -> bool:
-    """Whether a source is a film, or a folder with pictures in it or in ``images``."""
+def is_video_or_images(source: Path) -> bool:
+    """Whether a source is a video, or a folder with images in it or in ``images``."""
     if source.is_file():
-        return source.suffix.lower() in FILMS
-    return bool(pictures(source) or pictures(source / "images"))
+        return source.suffix.lower() in VIDEO_SUFFIXES
+    return bool(list_images(source) or list_images(source / "images"))
 
 
 def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
     """Choose frames, pose them, and read what was placed.
 
     Args:
-        source: a film, or a folder of pictures.
+        source: a video, or a folder of images.
         threads: that finding and matching features take; -1 for all. What is found does not depend on it.
         seed: of RANSAC.
 
@@ -65,8 +65,8 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
     if unread:
         console = Console(stderr=True, highlight=False)
         console.print(f"{source}: {warning_of(unread)}", markup=False, soft_wrap=True)
-    source = source if source.is_file() else first_with_pictures([source, source / "images"])
-    digest = digest_of([source] if source.is_file() else pictures(source), _VERSION, seed)
+    source = source if source.is_file() else first_with_images([source, source / "images"])
+    digest = digest_of([source] if source.is_file() else list_images(source), _VERSION, seed)
     folder = made_once(f"structure/{digest}", lambda partial: _make(source, partial, threads, seed))
     note = json.loads((folder / "note.json").read_text(encoding="utf-8"))
     capture = read_colmap(folder)
@@ -80,7 +80,7 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
         sequences=(name,) * len(capture.images),
         choices={**capture.choices, **kept, **note["choices"]},
         time_s=np.array([note["time_s"][image.name] for image in capture.images]) if note["time_s"] else None,
-        images_without_pose=tuple(image for image in pictures(folder / "images") if image not in placed),
+        images_without_pose=tuple(image for image in list_images(folder / "images") if image not in placed),
     )
 
 
@@ -90,8 +90,8 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
     images = folder / "images"
     images.mkdir()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        counts = None if source.is_file() else counts_of(pictures(source))
-        frames, total = frames_of(source) if source.is_file() else _of_pictures(source, counts)
+        counts = None if source.is_file() else counts_of(list_images(source))
+        frames, total = frames_of(source) if source.is_file() else _of_images(source, counts)
         is_film = source.is_file() or (total or 0) > _MOST_PHOTOGRAPHS
         seen = Counted(progress.track(frames, total=total, description="Choosing frames"))
         time_s, sizes = write_frames(choose_frames(seen) if is_film else seen, images)
@@ -116,9 +116,9 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
     (folder / "note.json").write_text(json.dumps(note, indent=2), encoding="utf-8")
 
 
-def _of_pictures(folder: Path, counts: Counts | None) -> tuple[Iterator[SourceFrame], int]:
-    """A folder's pictures in natural order, as frames."""
-    paths = pictures(folder)
+def _of_images(folder: Path, counts: Counts | None) -> tuple[Iterator[SourceFrame], int]:
+    """A folder's images in natural order, as frames."""
+    paths = list_images(folder)
     return (SourceFrame(str(at), at / PICTURES_HZ, read_image(path, counts)) for at, path in enumerate(paths)), len(
         paths
     )

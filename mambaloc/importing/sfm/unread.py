@@ -1,4 +1,4 @@
-"""What structure from motion does not read beside the pictures: files that may hold their poses."""
+"""What structure from motion does not read beside the images: files that may hold their poses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NAMED = 3
 def pose_like(source: Path) -> list[str]:
     """Files that look like ones of poses, relative to a folder: in it, and in the folders there.
 
-    Of a film, files beside it that bear its name.
+    Of a video, files beside it that bear its name.
     """
     if source.is_file():
         return sorted(path.name for path in source.parent.glob("*") if path.stem == source.stem and _is_like(path))
@@ -31,7 +31,7 @@ def warning_of(unread: list[str]) -> str:
     """A line that names the files, and what to do."""
     named = ", ".join(unread[:_NAMED]) + (f" and {len(unread) - _NAMED} more" if unread[_NAMED:] else "")
     return (
-        f"poses are made from the pictures alone; not read: {named}. If the poses are there, give that folder, or name "
+        f"poses are made from the images alone; not read: {named}. If the poses are there, give that folder, or name "
         "the format with --format."
     )
 

@@ -146,7 +146,7 @@ def _lacks_given(capture: Capture) -> str:
     if capture.split is None:
         return capture.split_concern or "no split of its own"
     counts = " and ".join(f"{capture.split.count(split)} {split} frames" for split in ("train", "test"))
-    return f"a split of its own with {counts} whose poses and pictures can be used, and both are needed"
+    return f"a split of its own with {counts} whose poses and images can be used, and both are needed"
 
 
 def best_of(proposals: Sequence[Proposal]) -> Proposal:

@@ -1,7 +1,7 @@
-"""How a capture's pictures are decoded: which pixels their poses mean, and which counts of 16 bits are black and white.
+"""How a capture's images are decoded: which pixels their poses mean, and which counts of 16 bits are black and white.
 
 Phones store pixels as the sensor has them, and an EXIF orientation says how to turn them. Whether a pose is that of the
-stored or of the upright picture is a property of what made it: COLMAP ignores the orientation on purpose
+stored or of the upright image is a property of what made it: COLMAP ignores the orientation on purpose
 (github.com/colmap/colmap, issue 1456), and so do nerfstudio (issue 1260 and pull request 1261 there) and instant-ngp,
 whose images stb_image decodes.
 """
@@ -37,16 +37,16 @@ _SAMPLED = 100
 
 @dataclass(frozen=True)
 class Decoding:
-    """What holds for all pictures of a capture.
+    """What holds for all images of a capture.
 
     Args:
         kind: the capture's format.
         upright: poses mean upright pixels; otherwise those that the files hold. A camera's size may say otherwise of
-            its own pictures.
-        count: how many pictures there are.
-        counts: black and white of 16-bit pictures; None where there are none.
-        turned: pictures with an EXIF orientation that were turned upright.
-        stored: pictures with one that were taken as stored.
+            its own images.
+        count: how many images there are.
+        counts: black and white of 16-bit images; None where there are none.
+        turned: images with an EXIF orientation that were turned upright.
+        stored: images with one that were taken as stored.
     """
 
     kind: str
@@ -57,13 +57,13 @@ class Decoding:
     stored: tuple[Path, ...] = ()
 
     def ways(self, data: bytes) -> Iterator[Image | str]:
-        """A file's picture as its pose most likely means it, and then the other way round, where there is one."""
+        """A file's image as its pose most likely means it, and then the other way round, where there is one."""
         yield decode_image(data, self.upright, self.counts)
         if orientation_of(data) >= _SIDEWAYS:
             yield decode_image(data, not self.upright, self.counts)
 
     def decided(self, is_upright: Mapping[Path, bool]) -> Decoding:
-        """The same, with how pictures were taken in the end."""
+        """The same, with how images were taken in the end."""
         of = {path: is_upright.get(path, self.upright) for path in (*self.turned, *self.stored)}
         turned, stored = (tuple(path for path, is_ in of.items() if is_ == wanted) for wanted in (True, False))
         return replace(self, turned=turned, stored=stored)
@@ -76,31 +76,31 @@ class Decoding:
         if self.stored:
             why = f"as {self.known} reads them" if self.known else "taken so: the format does not say"
             said.append(f"as stored, {why}; {self._some(self.stored)} have an EXIF orientation, dropped")
-        return {"pixels": "; ".join(said) or "as stored; no picture has an EXIF orientation", **choices_of(self.counts)}
+        return {"pixels": "; ".join(said) or "as stored; no image has an EXIF orientation", **choices_of(self.counts)}
 
     def _some(self, paths: Sequence[Path]) -> str:
-        return f"{len(paths)} of {self.count} pictures (such as {paths[0].name})"
+        return f"{len(paths)} of {self.count} images (such as {paths[0].name})"
 
     @property
     def known(self) -> str | None:
-        """What reads pictures of this format as stored, where that is known."""
+        """What reads images of this format as stored, where that is known."""
         return _KNOWN.get(self.kind)
 
 
 def choices_of(counts: Counts | None) -> dict[str, str]:
-    """What was decided of 16-bit pictures, by name; nothing where there are none."""
+    """What was decided of 16-bit images, by name; nothing where there are none."""
     if counts is None:
         return {}
     black, white = counts
     said = (
-        f"counts {black} to {white} are black to white in all pictures, which hold 8 bits now; pictures to localize "
+        f"counts {black} to {white} are black to white in all images, which hold 8 bits now; images to localize "
         f"need the same: localize.py --counts {black},{white}"
     )
     return {"16 bits": said}
 
 
 def decoding_of(capture: Capture) -> Decoding:
-    """Find out how to decode a capture's pictures from their first bytes, and from a few of them."""
+    """Find out how to decode a capture's images from their first bytes, and from a few of them."""
     images = capture.images
     with ThreadPoolExecutor() as pool:
         heads = list(pool.map(_orientation_and_depth, images))
@@ -113,13 +113,13 @@ def decoding_of(capture: Capture) -> Decoding:
 
 
 def counts_of(paths: Sequence[Path]) -> Counts | None:
-    """Black and white of 16-bit pictures, the same for all: what all but a few of their pixels lie between.
+    """Black and white of 16-bit images, the same for all: what all but a few of their pixels lie between.
 
     Args:
-        paths: of pictures, others among them perhaps; of many, some are read.
+        paths: of images, others among them perhaps; of many, some are read.
 
     Returns:
-        All 16 bits where the pictures use them; None where there is no 16-bit picture.
+        All 16 bits where the images use them; None where there is no 16-bit image.
     """
     rows = np.unique(np.linspace(0, len(paths) - 1, min(_SAMPLED, len(paths))).round().astype(int)).tolist()
     with ThreadPoolExecutor() as pool:
@@ -129,13 +129,13 @@ def counts_of(paths: Sequence[Path]) -> Counts | None:
 
 
 def _orientation_and_depth(path: Path) -> tuple[int, bool]:
-    """A picture's EXIF orientation, and whether it may have 16 bits; of one that cannot be read, neither."""
+    """An image's EXIF orientation, and whether it may have 16 bits; of one that cannot be read, neither."""
     head = head_of(path)
     return orientation_of(head), is_tiff(head) or (head.startswith(b"\x89PNG") and head[24:25] == b"\x10")
 
 
 def _are_upright(capture: Capture, sideways: Sequence[int]) -> bool:
-    """Whether cameras are shaped as upright pictures, where these are not shaped as stored ones."""
+    """Whether cameras are shaped as upright images, where these are not shaped as stored ones."""
     votes: list[bool] = []
     for row in sideways:
         if capture.camera_of is None or len(votes) == _ASKED:

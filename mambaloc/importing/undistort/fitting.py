@@ -1,8 +1,8 @@
-"""The camera rule of all formats: a camera is judged by its own pictures.
+"""The camera rule of all formats: a camera is judged by its own images.
 
-A picture of its camera's shape and another size was resized with all it shows: its camera scales with it. Pictures
+An image of its camera's shape and another size was resized with all it shows: its camera scales with it. Images
 whose sizes differ by a few percent, as COLMAP's undistorter leaves them, are cropped to one size, and their principal
-points move with the corner. A picture of any other shape was cropped where nothing says: no camera is right for it.
+points move with the corner. An image of any other shape was cropped where nothing says: no camera is right for it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MAPS_KEPT = 4  # of cameras, at a time: each is as large as a few images
 
 
 class FittedCameras:
-    """A capture's cameras, each fitted to the sizes of its own pictures."""
+    """A capture's cameras, each fitted to the sizes of its own images."""
 
     def __init__(self, told: Mapping[str, Camera]) -> None:
         self.told = told
@@ -36,11 +36,11 @@ class FittedCameras:
         self.lock = Lock()  # the first images of a camera all ask for its maps
 
     def size(self, name: str) -> Size:
-        """Of the pictures that a camera is told for."""
+        """Of the images that a camera is told for."""
         return self.told[name].size
 
     def fitted(self, name: str, size: Size) -> tuple[Camera, Maps | None] | None:
-        """The lens in pixels of a picture of that size, and maps that undistort it; None where the shapes differ."""
+        """The lens in pixels of an image of that size, and maps that undistort it; None where the shapes differ."""
         with self.lock:
             if (name, size) not in self.found:
                 lens = fitted(self.told[name], size)
@@ -51,13 +51,13 @@ class FittedCameras:
     def as_used(
         self, camera_of: Sequence[str] | None, sizes: Sequence[Size], common: Mapping[Size, Size]
     ) -> tuple[tuple[str, ...] | None, dict[str, Camera], dict[str, Camera]]:
-        """The name of each picture's camera, and the pinholes and the lenses that these names mean.
+        """The name of each image's camera, and the pinholes and the lenses that these names mean.
 
-        A camera of pictures of several sizes is as many; all but that of most pictures are named by their size, too.
+        A camera of images of several sizes is as many; all but that of most images are named by their size, too.
 
         Args:
-            camera_of: the name of each picture's camera in the capture; None where it has none.
-            sizes: of each picture, as it was fitted.
+            camera_of: the name of each image's camera in the capture; None where it has none.
+            sizes: of each image, as it was fitted.
             common: what each size is cropped to.
         """
         if camera_of is None:
@@ -79,14 +79,14 @@ class FittedCameras:
 
 
 def fitted(camera: Camera, size: Size) -> Camera | None:
-    """A camera in pixels of its picture of a size (width, height); None where that is of another shape."""
+    """A camera in pixels of its image of a size (width, height); None where that is of another shape."""
     if size == camera.size:
         return camera
     return scaled(camera, size) if is_same_shape(camera.size, size) else None
 
 
 def scaled(camera: Camera, size: Size) -> Camera:
-    """A camera in pixels of its pictures resized to (width, height), each side by itself, as COLMAP does."""
+    """A camera in pixels of its images resized to (width, height), each side by itself, as COLMAP does."""
     x, y = size[0] / camera.width, size[1] / camera.height
     lens = camera.distorted
 
@@ -100,7 +100,7 @@ def scaled(camera: Camera, size: Size) -> Camera:
 
 
 def cropped(pinhole: Camera, size: Size) -> Camera:
-    """A pinhole of the middle of its pictures, of a size (width, height)."""
+    """A pinhole of the middle of its images, of a size (width, height)."""
     width, height = size
     top, left = center_corner((pinhole.height, pinhole.width), (height, width))
     cx, cy = pinhole.center_px
@@ -108,9 +108,9 @@ def cropped(pinhole: Camera, size: Size) -> Camera:
 
 
 def common_sizes(sizes: Iterable[Size]) -> dict[Size, Size]:
-    """What pictures of each size are cropped to: the largest that all sizes near it hold.
+    """What images of each size are cropped to: the largest that all sizes near it hold.
 
-    A size is near another where both sides differ by a few percent. Of several, it joins the one of most pictures.
+    A size is near another where both sides differ by a few percent. Of several, it joins the one of most images.
     """
     counts = Counter(sizes)
     groups: dict[Size, list[Size]] = {}

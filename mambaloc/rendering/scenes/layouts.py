@@ -28,7 +28,7 @@ from mambaloc.rendering.scenes.tracks import write_nvm
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
 GENERATOR_VERSION = 1
-"""Raised with every change that renders other pictures."""
+"""Raised with every change that renders other images."""
 
 JPEG_QUALITY = 95
 _CAMBRIDGE_HEADER = "Visual Landmark Dataset V1\nImageFile, Camera Position [X Y Z W P Q R]\n\n"
@@ -53,7 +53,7 @@ def write_7scenes(
         scene: the new folder's name.
         shots: what to render, named ``seq-NN/frame-NNNNNN.color.png`` (or ``.jpg``), whole sequences in one split.
         room: what there is to see; by default a room around the shots' cameras.
-        size: ``(width, height)`` of the pictures, taken with :func:`default_intrinsics`.
+        size: ``(width, height)`` of the images, taken with :func:`default_intrinsics`.
         seed: of the room and of the sensor's noise.
         depth: also write ``.depth.png``: ``uint16`` millimetres, 65535 where there is nothing or it is farther.
         depth_every: that of frames whose number this divides, as real captures have it.
@@ -176,7 +176,7 @@ def _render_all(
     seed: int,
     write_labels: Callable[[Path, Shot, NDArray[np.float32]], None] | None = None,
 ) -> None:
-    """Take every picture into its file, and write what all layouts share."""
+    """Take every image into its file, and write what all layouts share."""
     if not shots:
         raise InputError(f"{folder.name}: a scene has at least one frame; give more poses")
     view = room or room_around(np.stack([shot.world_from_cam for shot in shots]), seed)
@@ -185,7 +185,7 @@ def _render_all(
 
     def take(number: int) -> None:
         shot, image = shots[number], folder / shots[number].image
-        # A label that is wrong by a mile still has a picture: taken in the room, as the real ones were.
+        # A label that is wrong by a mile still has an image: taken in the room, as the real ones were.
         seen_from = shot.world_from_cam.copy()
         seen_from[:3, 3] = np.clip(seen_from[:3, 3], lower, upper)
         rgb, depth_m = render(view, intrinsics, seen_from, size)

@@ -1,4 +1,4 @@
-"""The list of pictures to take: from sequences of poses, or from a table of a dataset's true poses."""
+"""The list of images to take: from sequences of poses, or from a table of a dataset's true poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _COLUMNS = ("scene", "split", "image", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One picture to take: its file, relative to the scene's folder, its split, and the camera's pose.
+    """One image to take: its file, relative to the scene's folder, its split, and the camera's pose.
 
     Shape:
         ``world_from_cam`` (4, 4), metres.

@@ -1,4 +1,4 @@
-"""A VisualSFM model (NVM_V3) of rendered pictures: points of what they show, tracked wherever they are in view."""
+"""A VisualSFM model (NVM_V3) of rendered images: points of what they show, tracked wherever they are in view."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from mambaloc.rendering.quads import Vectors
 from mambaloc.rendering.scenes.shots import Shot
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
-_POINTS = 4000  # in all: about as many in a picture as a real model has
+_POINTS = 4000  # in all: about as many in an image as a real model has
 _DEPTH_TOLERANCE = 0.02  # of the depth; the nearest pixel's is compared, which on a slanting plane is another
 
 
 def write_nvm(
     path: Path, shots: Sequence[Shot], depth_m: Mapping[str, NDArray[np.floating]], intrinsics: Vectors, seed: int
 ) -> None:
-    """Write cameras and points as Cambridge Landmarks ships them, its pictures named ``.jpg``.
+    """Write cameras and points as Cambridge Landmarks ships them, its images named ``.jpg``.
 
-    A point is tracked in every picture that it projects into at the depth rendered there; it needs two of them.
+    A point is tracked in every image that it projects into at the depth rendered there; it needs two of them.
 
     Args:
         path: the file.
-        shots: the pictures.
+        shots: the images.
         depth_m: what was rendered, (H, W) by the shot's image, 0 where there is nothing.
         intrinsics: (3, 3), with equal focal lengths and the principal point at the centre.
         seed: of the draw of points.
@@ -47,7 +47,7 @@ def write_nvm(
 
 
 def _drawn(shot: Shot, depth_m: NDArray[np.floating], intrinsics: Vectors, seed: int, shots: int) -> Vectors:
-    """One picture's share of the points: where some of its pixels are in the world, (K, 3)."""
+    """One image's share of the points: where some of its pixels are in the world, (K, 3)."""
     rng = np.random.default_rng([seed, *shot.image.encode()])
     filled = np.flatnonzero(depth_m)
     y, x = np.divmod(rng.choice(filled, min(len(filled), -(-_POINTS // shots)), replace=False), depth_m.shape[1])
@@ -59,7 +59,7 @@ def _drawn(shot: Shot, depth_m: NDArray[np.floating], intrinsics: Vectors, seed:
 def _seen(
     points_m: Vectors, shot: Shot, depth_m: NDArray[np.floating], intrinsics: Vectors
 ) -> tuple[NDArray[np.int64], Vectors]:
-    """Which points a picture shows, (K,), and at which pixels, (K, 2)."""
+    """Which points an image shows, (K,), and at which pixels, (K, 2)."""
     points_cam = (points_m - shot.world_from_cam[:3, 3]) @ shot.world_from_cam[:3, :3]
     ahead = np.flatnonzero(points_cam[:, 2] > 0)
     homogeneous = points_cam[ahead] @ intrinsics.T

@@ -2,7 +2,7 @@
 
 A search around a wrong pose finds matches, too: one of the few points near a keypoint is the most similar, and the pose
 follows those that agree by chance. Hardly any of these is distinctive: the most similar of all points in view.
-All matches of a blurred picture may be right and yet fix its pose to decimetres only: precision has its own bound.
+All matches of a blurred image may be right and yet fix its pose to decimetres only: precision has its own bound.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LEAST_PROBABILITY = 0.95
 MOST_DEVIATION = 0.12
 """The largest :attr:`Evidence.deviation` of an accepted pose: 8 cm in a room where key frames spread over 0.66 m."""
 CALIBRATION = {"frames": 224, "pictures": 3222, "accepted": 0.677, "accepted_and_wrong": 0.0009}
-"""How that was measured: frames held out of training, of a real room and a rendered one, each in two maps; pictures of
+"""How that was measured: frames held out of training, of a real room and a rendered one, each in two maps; images of
 them, disturbed, that gave a pose; the share that is accepted, with 20 inliers, by coefficients that were fitted to
 other sequences; and of these the wrong ones' (95 %: 0.03 to 0.33 %)."""
 
@@ -35,7 +35,7 @@ class Evidence:
     """What speaks for a pose, without units of length.
 
     Args:
-        cells: how many cells of a grid of 4 x 4 over the picture have a distinctive match that agrees with the pose.
+        cells: how many cells of a grid of 4 x 4 over the image have a distinctive match that agrees with the pose.
         deviation: of the position, one standard deviation in the worst direction, over the spread of the key frames:
             as all matches fix it or as distinctive ones alone do, whichever is larger.
         turn_deg: from RANSAC's pose to the refined one.
@@ -68,7 +68,7 @@ class Evidence:
 
 
 def occupied_cells(pixels: NDArray[np.float64], size: tuple[int, int]) -> int:
-    """How many cells of a grid over a picture of ``size`` (width, height) hold one of the pixels (N, 2) or more."""
+    """How many cells of a grid over an image of ``size`` (width, height) hold one of the pixels (N, 2) or more."""
     return len(np.unique(np.floor((pixels + 0.5) * (_CELLS / np.array(size))), axis=0))
 
 

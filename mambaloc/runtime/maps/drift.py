@@ -1,6 +1,6 @@
-"""The drift of the poses that a map was given: how far they are, by viewpoint, from poses that fit the pictures.
+"""The drift of the poses that a map was given: how far they are, by viewpoint, from poses that fit the images.
 
-A map's points and key frames are adjusted to the pictures. How far each key frame moved is known, and drift is smooth:
+A map's points and key frames are adjusted to the images. How far each key frame moved is known, and drift is smooth:
 a Gaussian process over viewpoints carries any pose from the map's adjusted frame to the frame of the given poses, and
 says how sure that is (Rasmussen and Williams 2006, equations 2.23 and 2.24).
 """
@@ -31,7 +31,7 @@ def fit_drift(adjusted: Floats, given: Floats) -> tuple[NDArray[np.float64], flo
     Where poses were given exactly, all moves are the adjustment's noise, and its variance must not be taken for drift.
 
     Args:
-        adjusted: ``world_from_cam`` of key frames as they fit the pictures, (K, 4, 4).
+        adjusted: ``world_from_cam`` of key frames as they fit the images, (K, 4, 4).
         given: the same as they were given.
 
     Returns:

@@ -19,20 +19,20 @@ DESCRIPTOR_SCALE = 512.0
 """A stored descriptor is the unit vector times this, rounded and cut to 0..255, as COLMAP has it."""
 
 _MOST_KEYPOINTS = 1000
-_CONTRAST = 0.02  # half of OpenCV's default: small pictures have few keypoints
+_CONTRAST = 0.02  # half of OpenCV's default: small images have few keypoints
 
 
 @dataclass(frozen=True)
 class Features:
-    """Keypoints of one picture.
+    """Keypoints of one image.
 
     Shape:
-        ``pixels`` (N, 2) in the picture as it was searched; ``descriptors`` (N, 128) float32 of unit length.
+        ``pixels`` (N, 2) in the image as it was searched; ``descriptors`` (N, 128) float32 of unit length.
 
     Args:
         pixels: the centre of the top-left pixel is (0, 0).
         descriptors: RootSIFT, so that their product is the Bhattacharyya coefficient of two histograms.
-        intrinsics: (3, 3) pinhole matrix of the picture as it was searched.
+        intrinsics: (3, 3) pinhole matrix of the image as it was searched.
         size: its (width, height).
     """
 
@@ -55,16 +55,16 @@ class Features:
 
     @property
     def corner_rays(self) -> Floats:
-        """The same of the picture's upper left and lower right corner, (2, 2)."""
+        """The same of the image's upper left and lower right corner, (2, 2)."""
         return normalized([(-0.5, -0.5), (self.size[0] - 0.5, self.size[1] - 0.5)], self.intrinsics)
 
 
 class Keypoints(NamedTuple):
-    """What SIFT finds in a picture once it is made smaller, whatever its camera.
+    """What SIFT finds in an image once it is made smaller, whatever its camera.
 
     Shape:
-        ``pixels`` (N, 2) float32 of the smaller picture; ``histograms`` (N, 128) uint8; ``size`` and ``full_size``
-        (2,), width and height of the smaller picture and of the picture itself.
+        ``pixels`` (N, 2) float32 of the smaller image; ``histograms`` (N, 128) uint8; ``size`` and ``full_size``
+        (2,), width and height of the smaller image and of the image itself.
     """
 
     pixels: NDArray[np.float32]
@@ -73,10 +73,10 @@ class Keypoints(NamedTuple):
     full_size: NDArray[np.int64]
 
     def described(self, intrinsics: ArrayLike) -> Features:
-        """With RootSIFT descriptors, and the camera of the picture itself, (3, 3).
+        """With RootSIFT descriptors, and the camera of the image itself, (3, 3).
 
         Raises:
-            InputError: where the intrinsics do not fit the picture.
+            InputError: where the intrinsics do not fit the image.
         """
         (width, height), size = self.full_size.tolist(), (int(self.size[0]), int(self.size[1]))
         check_intrinsics(intrinsics, (width, height))
@@ -87,11 +87,11 @@ class Keypoints(NamedTuple):
 
 
 def find_keypoints(image: Image, scale: float) -> Keypoints:
-    """Find the keypoints of a picture once it is made smaller.
+    """Find the keypoints of an image once it is made smaller.
 
     Args:
         image: RGB (H, W, 3), ``uint8``, without distortion.
-        scale: width of the smaller picture over that of the picture; 1 at most counts.
+        scale: width of the smaller image over that of the image; 1 at most counts.
     """
     height, width = image.shape[:2]
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
@@ -107,26 +107,26 @@ def find_keypoints(image: Image, scale: float) -> Keypoints:
 
 
 def detect_features(image: Image, intrinsics: ArrayLike, scale: float) -> Features:
-    """Find and describe the keypoints of a picture; arguments are those of :func:`find_keypoints`.
+    """Find and describe the keypoints of an image; arguments are those of :func:`find_keypoints`.
 
     Raises:
-        InputError: where the intrinsics, (3, 3), do not fit the picture.
+        InputError: where the intrinsics, (3, 3), do not fit the image.
     """
     check_intrinsics(intrinsics, (image.shape[1], image.shape[0]))
     return find_keypoints(image, scale).described(intrinsics)
 
 
 def rescaled_intrinsics(intrinsics: ArrayLike, size: tuple[int, int], new_size: tuple[int, int]) -> Floats:
-    """The (3, 3) pinhole matrix once a picture of ``size`` (width, height) is resized; corners stay corners."""
+    """The (3, 3) pinhole matrix once an image of ``size`` (width, height) is resized; corners stay corners."""
     x, y = new_size[0] / size[0], new_size[1] / size[1]
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]]) @ np.asarray(intrinsics, np.float64)
 
 
 def check_intrinsics(intrinsics: ArrayLike, size: tuple[int, int]) -> None:
-    """Refuse a matrix that cannot be the camera of a picture of ``size`` (width, height).
+    """Refuse a matrix that cannot be the camera of an image of ``size`` (width, height).
 
     Raises:
-        InputError: where it is not a pinhole matrix, its centre lies outside of the picture, or the picture would be
+        InputError: where it is not a pinhole matrix, its centre lies outside of the image, or the image would be
             less than 6 or more than 160 degrees wide.
     """
     matrix = np.asarray(intrinsics, np.float64)
@@ -137,8 +137,8 @@ def check_intrinsics(intrinsics: ArrayLike, size: tuple[int, int]) -> None:
     if not fits:
         numbers = np.array2string(matrix, precision=1, separator=" ").replace("\n", "")
         raise InputError(
-            f"intrinsics {numbers}: cannot be the camera of a picture of {size[0]}x{size[1]}; give fx, fy, cx and cy "
-            "in pixels of that picture"
+            f"intrinsics {numbers}: cannot be the camera of an image of {size[0]}x{size[1]}; give fx, fy, cx and cy "
+            "in pixels of that image"
         )
 
 

@@ -1,4 +1,4 @@
-"""Where a picture was taken, from a sparse map."""
+"""Where an image was taken, from a sparse map."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _SHARED = 1.25  # of variances: neighbouring matches share errors; chosen on fra
 
 @dataclass(frozen=True)
 class MapLocalization:
-    """Where one picture was taken, ``world_from_cam``, and how sure that is.
+    """Where one image was taken, ``world_from_cam``, and how sure that is.
 
     Shape:
         ``position_m`` (3,) camera centre in metres; ``quaternion`` (4,) unit, wxyz, ``w >= 0``; ``covariance`` (6, 6).
@@ -83,7 +83,7 @@ class _Matches(NamedTuple):
 
 
 class MapLocalizer:
-    """Localize pictures in a map, without torch and without a network.
+    """Localize images in a map, without torch and without a network.
 
     The points that most frames see are matched at once, RANSAC finds a pose, and every point is searched again around
     where that pose projects it to.
@@ -112,7 +112,7 @@ class MapLocalizer:
     def localize(
         self, image: Image, intrinsics: ArrayLike | None = None, prior: CameraPose | None = None
     ) -> MapLocalization:
-        """Localize one picture.
+        """Localize one image.
 
         Args:
             image: RGB (H, W, 3) or grey (H, W), ``uint8``, of any size, without distortion.
@@ -120,22 +120,22 @@ class MapLocalizer:
             prior: a pose to search around where all points at once find none to accept, such as a network's.
 
         Raises:
-            InputError: for another kind of array, intrinsics that do not fit the picture, or none for a picture of
+            InputError: for another kind of array, intrinsics that do not fit the image, or none for an image of
                 another shape than the map's.
         """
         return self.localize_features(self.features(image, intrinsics), prior)
 
     def features(self, image: Image, intrinsics: ArrayLike | None = None) -> Features:
-        """Find a picture's keypoints as the map's were found; arguments and errors are those of :meth:`localize`."""
+        """Find an image's keypoints as the map's were found; arguments and errors are those of :meth:`localize`."""
         rgb = as_rgb(image)
         matrix = self._intrinsics(rgb) if intrinsics is None else np.asarray(intrinsics, np.float64)
         check_intrinsics(matrix, (rgb.shape[1], rgb.shape[0]))
-        # So that things are as large as in the map's pictures, whatever the lens.
+        # So that things are as large as in the map's images, whatever the lens.
         found = detect_features(rgb, matrix, self.map.intrinsics[0, 0] / matrix[0, 0])
         return self.map.lens.straighten(found) if self._is_own_camera(found) else found
 
     def localize_features(self, features: Features, prior: CameraPose | None = None) -> MapLocalization:
-        """Localize a picture whose keypoints :meth:`features` found."""
+        """Localize an image whose keypoints :meth:`features` found."""
         best, is_clear = unambiguous(features.descriptors @ self._often_descriptors, _RATIO)
         rng = np.random.default_rng(self.seed)
         start = ransac_pose(self._often_m[best[is_clear]], features.rays[is_clear], self._near, rng)
@@ -208,7 +208,7 @@ class MapLocalizer:
         return Evidence(occupied_cells(pixels, features.size), deviation, float(turn_deg))
 
     def matches(self, features: Features, pose: CameraPose) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Points that a picture shows where its pose projects them: rows of keypoints and of points."""
+        """Points that an image shows where its pose projects them: rows of keypoints and of points."""
         found = self._search(features, pose, self._near)
         return found.keypoints, found.points
 
@@ -237,7 +237,7 @@ class MapLocalizer:
         return np.asarray(self._views[nearest].any(axis=0))
 
     def _is_own_camera(self, features: Features) -> bool:
-        """Whether a picture, of any resolution, claims to be of the map's camera, whose lens is known."""
+        """Whether an image, of any resolution, claims to be of the map's camera, whose lens is known."""
         (width, height), most = self.map.size, 0.01 * self.map.size[0]
         as_large = rescaled_intrinsics(features.intrinsics, features.size, self.map.size)
         has_shape = abs(features.size[1] * width / features.size[0] - height) <= most
@@ -247,14 +247,14 @@ class MapLocalizer:
         height, width = image.shape[:2]
         if abs(width * self.map.size[1] - height * self.map.size[0]) > max(self.map.size):
             raise InputError(
-                f"picture of {width}x{height}: its shape differs from the map's pictures of "
+                f"image of {width}x{height}: its shape differs from the map's images of "
                 f"{self.map.size[0]}x{self.map.size[1]}, so its camera is unknown. Give its intrinsics."
             )
         return rescaled_intrinsics(self.map.intrinsics, self.map.size, (width, height))
 
 
 def near_px(width: int) -> float:
-    """How far a match may be from where its point is projected, in pixels of a picture that is so wide.
+    """How far a match may be from where its point is projected, in pixels of an image that is so wide.
 
     Poses of a real capture drift by that much; where matches agree better, the refinement follows them.
     """

@@ -46,8 +46,8 @@ class SparseMap:
         points_m: positions of the points.
         descriptors: one a point.
         views: which key frames see each point.
-        key_poses: ``world_from_cam`` of the key frames, adjusted to the pictures as the points are.
-        size: (width, height) of the pictures in which keypoints were searched.
+        key_poses: ``world_from_cam`` of the key frames, adjusted to the images as the points are.
+        size: (width, height) of the images in which keypoints were searched.
         intrinsics: of their camera, of the first key frame where there are several.
         least_inliers: matches that a pose needs to be accepted.
         scene: name of the place.
@@ -61,7 +61,7 @@ class SparseMap:
             last they are.
         first_drift: ``drift`` before any key frame was added; (0, 6) where it has not changed since.
         world: where the scene's frame lies in that of the data it was made of.
-        undistortion: how its pictures were made of what their camera stored.
+        undistortion: how its images were made of what their camera stored.
     """
 
     points_m: NDArray[np.float32]
@@ -182,7 +182,7 @@ class SparseMap:
         if not all(np.isfinite(arrays[name]).all() for name in _ARRAYS if _ARRAYS[name][0] != np.uint8):
             raise ValueError("numbers are not finite")
         if not 0 < width <= LARGEST_SIDE_PX or not 0 < height <= LARGEST_SIDE_PX:
-            raise ValueError(f"pictures of {width}x{height}")
+            raise ValueError(f"images of {width}x{height}")
         if not 0 < (nugget := float(about.get("nugget", NUGGET))) < math.inf:
             raise ValueError(f"nugget of {nugget}")
         check_intrinsics(arrays["intrinsics"], (width, height))

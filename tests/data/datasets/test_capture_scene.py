@@ -23,7 +23,7 @@ SPLITS = ("train",) * 6 + ("unused",) * 2 + ("val",) * 2 + ("test",) * 3
 
 @pytest.fixture
 def scene(tmp_path):
-    """Thirteen frames, written by hand; a picture's red says which one it is."""
+    """Thirteen frames, written by hand; an image's red says which one it is."""
     folder = tmp_path / "scenes" / "den"
     (folder / "images" / "walk").mkdir(parents=True)
     rng = np.random.default_rng(3)
@@ -242,7 +242,7 @@ def test_marked_needs_a_scene_that_marks(write_tiny_scene, tmp_path):
 
 
 def test_a_bad_validation_image_is_skipped_and_counted(scene, tmp_path):
-    (scene / "images/walk/008.png").write_bytes(b"no picture")
+    (scene / "images/walk/008.png").write_bytes(b"no image")
     data = module(scene, tmp_path, on_bad_frame="skip")
     data.setup("fit")
     assert len(data.frames("val")) == 1
@@ -260,7 +260,7 @@ def test_a_camera_of_pictures_of_another_shape_is_refused(scene, tmp_path):
 
 @pytest.mark.parametrize("has_cameras", [True, False])
 def test_upright_and_lying_pictures_train_together(scene, tmp_path, has_cameras):
-    """A bright spot on a known ray is where the intrinsics of the middle say, whatever its picture's shape."""
+    """A bright spot on a known ray is where the intrinsics of the middle say, whatever its image's shape."""
     shapes = {"phone": (32, 24), "tablet": (48, 64)}
     ray, cameras, expected = np.array([0.1, 0.2, 1.0]), {}, {}
     for name, (width, height) in shapes.items():

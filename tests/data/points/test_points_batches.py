@@ -70,7 +70,7 @@ def projected(batch: PoseBatch) -> np.ndarray:
 
 
 def red_centers(image: torch.Tensor) -> np.ndarray:
-    """The centre of what is red in each picture, pixels (B, 2)."""
+    """The centre of what is red in each image, pixels (B, 2)."""
     red = image[:, 0].double()
     red = red / red.sum((-2, -1), keepdim=True)
     x = (red.sum(-2) * torch.arange(image.shape[-1])).sum(-1)

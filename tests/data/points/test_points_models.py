@@ -276,7 +276,7 @@ def test_a_colmap_model_is_read_as_it_was_written(yard, place, binary, camera_mo
     np.testing.assert_array_equal(finite(points.points_m[0]), [[1, 2, 9]])
     np.testing.assert_array_equal(sorted(finite(points.points_m[1]).tolist()), [[1, 2, 9], [5, 5, 5]])
     cameras = known_cameras("cambridge", yard, read_split(yard, "train", BadFrames()))
-    focal_y = 51 if camera_model == "PINHOLE" else 50  # the model is of pictures of twice the size, 80x60
+    focal_y = 51 if camera_model == "PINHOLE" else 50  # the model is of images of twice the size, 80x60
     by_hand = [[50, 0, 41 / 2 - 0.5], [0, focal_y, 29 / 2 - 0.5], [0, 0, 1]]  # COLMAP counts from the corner
     np.testing.assert_allclose(cameras.intrinsics, [by_hand] * 4)
     assert (cameras.size_px == (40, 30)).all()
@@ -320,7 +320,7 @@ def test_a_damaged_colmap_model_is_named_in_one_line(yard, file, keep):
         ("cameras.txt", "1 PINHOLE 80 60 0 102 41 29\n", "holds a camera without a size"),
         ("cameras.txt", "1 PINHOLE 80 60 nan 102 41 29\n", "is no COLMAP model that pycolmap can read"),
         ("cameras.txt", "1 PINHOLE\n", "is no COLMAP model that pycolmap can read"),
-        ("images.txt", "text\n\n", "images.txt, line 1: is no picture 'IMAGE_ID QW"),
+        ("images.txt", "text\n\n", "images.txt, line 1: is no image 'IMAGE_ID QW"),
     ],
 )
 def test_a_damaged_text_model_is_named_in_one_line(yard, file, line, says):

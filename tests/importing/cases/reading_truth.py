@@ -18,13 +18,13 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def true_poses(file: Path) -> dict[str, NDArray[np.float64]]:
-    """``world_from_cam`` (4, 4) by picture, of lines ``image,x,y,z,qw,qx,qy,qz``."""
+    """``world_from_cam`` (4, 4) by image, of lines ``image,x,y,z,qw,qx,qy,qz``."""
     with file.open(newline="") as lines:
         return {row["image"]: _matrix(row) for row in csv.DictReader(lines)}
 
 
 def scene_poses(scene: Path) -> dict[str, NDArray[np.float64]]:
-    """``world_from_cam`` (4, 4) of an imported scene in its source's world, by the picture's name without folders."""
+    """``world_from_cam`` (4, 4) of an imported scene in its source's world, by the image's name without folders."""
     world = json.loads((scene / "scene.json").read_text()).get("world", {})
     found = {}
     with (scene / "frames.csv").open(newline="") as lines:
@@ -40,7 +40,7 @@ def scene_poses(scene: Path) -> dict[str, NDArray[np.float64]]:
 def assert_true(
     found: dict[str, NDArray[np.float64]], truth: dict[str, NDArray[np.float64]], atol: float = 2e-6
 ) -> None:
-    """Whether each picture of the truth has its pose, and no other picture has one."""
+    """Whether each image of the truth has its pose, and no other image has one."""
     assert set(found) == set(truth)
     for name, pose in truth.items():
         np.testing.assert_allclose(found[name], pose, atol=atol, err_msg=name)

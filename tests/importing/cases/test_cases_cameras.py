@@ -1,4 +1,4 @@
-"""Real captures whose cameras, pictures, paths or models were read wrongly or refused once: each as its truth says."""
+"""Real captures whose cameras, images, paths or models were read wrongly or refused once: each as its truth says."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from mambaloc.importing.registry import read_capture
 
 pytestmark = needs_cases
 
-FOCAL = 144 / 160  # of each picture's width, in all cases
+FOCAL = 144 / 160  # of each image's width, in all cases
 
 
 @pytest.fixture
 def imported(tmp_path):
-    """Import a case, check poses against the truth, and pictures against poses; return what ``scene.json`` says."""
+    """Import a case, check poses against the truth, and images against poses; return what ``scene.json`` says."""
 
     def imported(source: str, without: tuple[str, ...] = (), images: str | None = None):
         scene = tmp_path / "scene"
@@ -44,7 +44,7 @@ def imported(tmp_path):
 
 
 def _safe(name: str) -> str:
-    """How an imported scene spells a picture's name."""
+    """How an imported scene spells an image's name."""
     return f"{re.sub(r'[^a-z0-9.-]+', '_', Path(name).stem.lower()).strip('_')}{Path(name).suffix}"
 
 
@@ -53,7 +53,7 @@ def sizes(said) -> set[tuple[int, int]]:
 
 
 def pictures(scene: Path) -> Counter:
-    """How many pictures of a scene have each size, (width, height)."""
+    """How many images of a scene have each size, (width, height)."""
     return Counter(cv2.imread(str(row.image)).shape[1::-1] for row in read_rows(scene))
 
 
@@ -97,7 +97,7 @@ def test_two_devices_are_read_each_with_its_camera(imported, tmp_path, kind, siz
 def test_sizes_that_differ_by_pixels_are_cropped_to_one(imported, tmp_path):
     said = imported("undistorted-sizes/capture")
     assert pictures(tmp_path / "scene") == {(158, 118): 24}
-    assert "20 of 24 pictures to the middle" in said["choices"]["cropped"]
+    assert "20 of 24 images to the middle" in said["choices"]["cropped"]
     for row in read_rows(tmp_path / "scene"):
         camera = said["cameras"][row.camera]
         whole = cv2.imread(str(CASES / "undistorted-sizes/capture/images" / row.image.name))
@@ -155,7 +155,7 @@ def test_pictures_beside_the_folder_are_found_where_images_says(imported, tmp_pa
         tool(CASES / "paths-elsewhere/up/nerf", "--out", tmp_path / "refused")
     error = capsys.readouterr().err.strip()
     assert len(error.splitlines()) == 1
-    assert error.endswith("Give the folder of the pictures with --images.")
+    assert error.endswith("Give the folder of the images with --images.")
     imported("paths-elsewhere/up/nerf", images="paths-elsewhere/up/images")
 
 
@@ -174,13 +174,13 @@ def test_a_line_that_is_no_picture_is_named_with_the_rule(tmp_path, kind):
     file = tmp_path / "capture/sparse/0/images.txt"
     file.write_text(file.read_text() + "25 1 0.5 0 0 0 0 0 1\n")  # without its name
     with pytest.raises(
-        InputError, match=r"images\.txt, line (50|26): is no picture .* two lines a picture, the second empty"
+        InputError, match=r"images\.txt, line (50|26): is no image .* two lines an image, the second empty"
     ):
         read_capture(tmp_path / "capture")
 
 
 def test_files_beside_pictures_are_named_before_structure_from_motion(tmp_path, capsys, monkeypatch):
-    """``paths-elsewhere/up`` has pictures, and the poses in a folder beside."""
+    """``paths-elsewhere/up`` has images, and the poses in a folder beside."""
     monkeypatch.setattr("mambaloc.importing.sfm.structure.made_once", lambda *_: pytest.fail(capsys.readouterr().err))
     with pytest.raises(
         pytest.fail.Exception, match=r"not read: nerf/transforms\.json\. If the poses are there, give that"

@@ -1,4 +1,4 @@
-"""Cases of pictures, texts and folders that are read, and of runs: what happens must be what each README says."""
+"""Cases of images, texts and folders that are read, and of runs: what happens must be what each README says."""
 
 import csv
 import json
@@ -27,8 +27,8 @@ pytestmark = needs_cases
 
 @pytest.fixture
 def no_camera(monkeypatch):
-    """A test that opens a film or a camera fails."""
-    monkeypatch.setattr(cv2, "VideoCapture", lambda what: pytest.fail(f"{what} was opened as a film or a camera"))
+    """A test that opens a video or a camera fails."""
+    monkeypatch.setattr(cv2, "VideoCapture", lambda what: pytest.fail(f"{what} was opened as a video or a camera"))
 
 
 def test_exif_upside_down(tmp_path):
@@ -52,7 +52,7 @@ def test_phone_heic_is_refused_by_name(no_camera, tmp_path, monkeypatch, refused
         shutil.copy(photo, tmp_path / f"photos/{number}.heic")
         frames.append({"file_path": f"photos/{number}.heic", "transform_matrix": np.eye(4).tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 400, "frames": frames}))
-    renamed = shutil.copy(photo, tmp_path / "photo.mov")  # a film by its name
+    renamed = shutil.copy(photo, tmp_path / "photo.mov")  # a video by its name
     for source in (photo, tmp_path / "photos", renamed):
         refused(lambda source: list(frames_of(source)[0]), source, "is HEIC", "mambaloc[heic]", "JPEG")
     refused(lambda source: read_capture(source), tmp_path, "photos/0.heic", "is HEIC", "mambaloc[heic]")
@@ -75,7 +75,7 @@ def test_sixteen_bit(tmp_path):
     assert seen.dtype == np.uint8
     black, white = map(int, capture.choices["16 bits"].rpartition(" ")[2].split(","))
     expected = np.clip(np.rint((counts.astype(float) - black) * 255 / (white - black)), 0, 255)
-    np.testing.assert_array_equal(seen, np.repeat(expected[..., None], 3, axis=-1))  # one line for all pictures
+    np.testing.assert_array_equal(seen, np.repeat(expected[..., None], 3, axis=-1))  # one line for all images
     assert len(np.unique(seen)) > 200
     assert np.isin(seen, (0, 255)).mean() < 0.01
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Camera
-from mambaloc.importing.formats.finding import find_pictures
+from mambaloc.importing.formats.finding import find_images
 from mambaloc.importing.undistort.fitting import common_sizes, fitted
-from mambaloc.importing.undistort.pictures import write_pictures
+from mambaloc.importing.undistort.images import write_images
 from mambaloc.runtime.camera_models import OpenCVModel
 
 SPREAD = 90.0  # grey levels a unit of ray
@@ -27,7 +27,7 @@ SPREAD = 90.0  # grey levels a unit of ray
 
 
 def seen(width, height, focal, center, k1):
-    """A picture whose red and green say where the ray of a pixel meets the plane at depth 1."""
+    """An image whose red and green say where the ray of a pixel meets the plane at depth 1."""
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     rays = np.stack(((columns - center[0]) / focal[0], (rows - center[1]) / focal[1]), axis=-1)
     ideal = rays.copy()
@@ -40,7 +40,7 @@ def seen(width, height, focal, center, k1):
 
 @st.composite
 def devices(draw):
-    """Cameras of (width, height, focal, centre from the corner, k1) for pictures of (width, height), of their shape."""
+    """Cameras of (width, height, focal, centre from the corner, k1) for images of (width, height), of their shape."""
     width, height = draw(st.sampled_from([(48, 36), (36, 48), (64, 36), (40, 40)]))
     width, height = width + draw(st.integers(-1, 1)), height + draw(st.integers(-1, 1))
     scale = draw(st.sampled_from([1, 1, 1, 2, 4]))
@@ -66,7 +66,7 @@ def test_written_pictures_show_what_their_cameras_say(devices):
         capture = capture_of(
             poses_at(line(len(images))), images=tuple(images), cameras=cameras, camera_of=tuple(cameras)
         )
-        written = write_pictures(capture, folder / "out")
+        written = write_images(capture, folder / "out")
         assert written.rules == {}
         assert len(written.capture.images) == len(devices)
         for image, camera_name, size in zip(
@@ -153,19 +153,19 @@ def test_a_picture_is_found_by_the_longest_end_of_its_path(files, prefix, data):
         exact = {path for path in expected if path.split("/")[-1] == told.split("/")[-1]}
         expected = exact if len(exact) == 1 else expected
         if len(expected) > 1:
-            with pytest.raises(InputError, match=r"which may be .* or .* in .*\. Give the folder of the pictures with"):
-                find_pictures(root, [(name, "here")])
+            with pytest.raises(InputError, match=r"which may be .* or .* in .*\. Give the folder of the images with"):
+                find_images(root, [(name, "here")])
         else:
-            (found,) = find_pictures(root, [(name, "here")]).files
+            (found,) = find_images(root, [(name, "here")]).files
             assert {found.relative_to(root).as_posix()} == expected
 
 
 def test_a_bare_name_does_not_stand_for_another_folders_picture(tmp_path):
-    """Frames of one recording are numbered as another's: without its folder a picture stays missing."""
+    """Frames of one recording are numbered as another's: without its folder an image stays missing."""
     for path in ("seq2/1.png", "seq3/1.png", "seq3/2.png"):
         (tmp_path / path).parent.mkdir(exist_ok=True)
         (tmp_path / path).touch()
-    found = find_pictures(tmp_path, [("seq1/1.png", "a"), ("seq3/1.png", "b"), ("seq3/2.png", "c")])
+    found = find_images(tmp_path, [("seq1/1.png", "a"), ("seq3/1.png", "b"), ("seq3/2.png", "c")])
     assert [file.is_file() for file in found.files] == [False, True, True]
     assert found.elsewhere == ""
 
@@ -177,7 +177,7 @@ def test_links_that_lead_out_are_not_searched(tmp_path):
     (tmp_path / "root/folder").symlink_to(tmp_path / "secret")
     (tmp_path / "root/images/key.png").symlink_to(tmp_path / "secret/key.png")
     with pytest.raises(InputError, match="which is no file inside of"):
-        find_pictures(tmp_path / "root", [("/home/user/images/key.png", "here")])
+        find_images(tmp_path / "root", [("/home/user/images/key.png", "here")])
 
 
 def made(root: Path, *paths: str) -> Path:
@@ -198,7 +198,7 @@ def made(root: Path, *paths: str) -> Path:
     ],
 )
 def test_a_picture_with_another_suffix_is_found_by_its_stem(tmp_path, name, files, place):
-    found = find_pictures(made(tmp_path, *files), [(name, "here")])
+    found = find_images(made(tmp_path, *files), [(name, "here")])
     assert found.files == (tmp_path / place,)
     assert found.missing == frozenset()
     assert found.elsewhere.endswith(f" is {place}") or Path(name).name == Path(place).name
@@ -208,15 +208,15 @@ def test_a_stem_of_several_pictures_or_of_another_folder_is_not_taken(tmp_path):
     """A folder of another name may hold depth."""
     made(tmp_path, "images_4/1.png", "images_4/1.webp", "depth/2.png", "cam/3.jpg", "cam_2/3.jpg")
     with pytest.raises(InputError, match=r"may be images_4/1\.png or images_4/1\.webp"):
-        find_pictures(tmp_path, [("images/1.jpg", "here")])
+        find_images(tmp_path, [("images/1.jpg", "here")])
     with pytest.raises(InputError, match=r"^\S+: has no image with a pose; 1 are named and missing") as refusal:
-        find_pictures(tmp_path, [("images/2.jpg", "here")])
+        find_images(tmp_path, [("images/2.jpg", "here")])
     assert str(refusal.value).count("--images") == 1
     made(tmp_path, "masks/4.jpg")
     with pytest.raises(InputError, match=r"has no image with a pose; 1 are named and missing, such as '4\.jpg'"):
-        find_pictures(tmp_path, [("4.jpg", "here")])
+        find_images(tmp_path, [("4.jpg", "here")])
     with pytest.raises(InputError, match=r"may be cam/3\.jpg or cam_2/3\.jpg"):
-        find_pictures(tmp_path, [("3.jpg", "here")])
+        find_images(tmp_path, [("3.jpg", "here")])
 
 
 # --- texts of COLMAP -------------------------------------------------------------------------------------------------
@@ -264,5 +264,5 @@ def test_a_failing_search_walks_the_folder_once(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "walk", lambda top: walks.append(top) or walk(top))
     made(tmp_path, "images/1.png")
     with pytest.raises(InputError, match=r"such as 'images/2\.png', while 'images/1\.png' is there"):
-        find_pictures(tmp_path, [("images/2.png", "here")])
+        find_images(tmp_path, [("images/2.png", "here")])
     assert walks == [tmp_path]

@@ -1,4 +1,4 @@
-"""Pictures compared with poses and cameras that are right, and wrong in known ways."""
+"""Images compared with poses and cameras that are right, and wrong in known ways."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mambaloc.importing.checks.explanations import AS_READ, CONVENTIONS, better_
 from mambaloc.importing.checks.matching import Matches, find_matches
 from mambaloc.importing.motion import motion_of
 from mambaloc.importing.registry import read_capture
-from mambaloc.importing.undistort.pictures import selected, write_pictures
+from mambaloc.importing.undistort.images import selected, write_images
 from mambaloc.rendering import default_intrinsics, embedded_walk, render
 
 REDKITCHEN = Path(__file__).parents[3].parent / "shared" / "data" / "7scenes_blocks" / "redkitchen"
@@ -28,7 +28,7 @@ REDKITCHEN = Path(__file__).parents[3].parent / "shared" / "data" / "7scenes_blo
 
 @pytest.fixture(scope="module")
 def written(rendered_once, tmp_path_factory):
-    return write_pictures(read_capture(rendered_once.folder), tmp_path_factory.mktemp("written"))[0]
+    return write_images(read_capture(rendered_once.folder), tmp_path_factory.mktemp("written"))[0]
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def matches(written):
 
 @pytest.fixture(scope="module")
 def filmed(room, tmp_path_factory):
-    """Forty pictures of the room with exact poses, intrinsics and depth."""
+    """Forty images of the room with exact poses, intrinsics and depth."""
     folder, poses, matrix = tmp_path_factory.mktemp("filmed"), embedded_walk(40, 5, 60.0, 3.0), default_intrinsics(SIZE)
     for row, pose in enumerate(poses):
         rgb, depth_m = render(room, matrix, pose, SIZE)
@@ -60,7 +60,7 @@ def checked(capture):
 
 
 def of_one_pair(first, second):
-    """Matches of rows 0 and 1 in pictures of so long a focal length that a pixel is 1e-6."""
+    """Matches of rows 0 and 1 in images of so long a focal length that a pixel is 1e-6."""
     rows = np.zeros(len(first), np.int64)
     return Matches(np.array([[0, 1]]), rows, first, second, np.array([1.5e6]), 1, False)
 
@@ -81,7 +81,7 @@ def test_matches_of_known_points_agree_and_others_do_not():
     still = poses.copy()
     still[1, :3, 3] = 0  # draws no lines
     assert not agrees(of_one_pair(first, second), still).any()
-    # The same pictures, whose camera is thought to be longer by a tenth.
+    # The same images, whose camera is thought to be longer by a tenth.
     longer = of_one_pair(first / 1.1, second / 1.1)
     assert agrees(longer, poses).mean() < 0.05
     assert agrees(longer, poses, focal=1 / 1.1).all()
@@ -132,18 +132,18 @@ def test_pictures_of_other_poses_agree_with_none(written):
 
 @pytest.mark.parametrize(("shift", "says"), [(4, "the poses of 4 frames later"), (-1, "the poses of 1 frame earlier")])
 def test_a_delay_is_found(written, shift, says):
-    """Picture k has the pose of frame k - shift."""
+    """Image k has the pose of frame k - shift."""
     rows = np.arange(20, 36) - 10
     capture = replace(selected(written, rows.tolist()), world_from_cam=written.world_from_cam[rows - shift])
     found = better_order(capture, find_matches(capture, motion_of(capture)))
     assert found.name == says
     assert found.share > 0.9 > found.as_read + 0.1
-    assert f"the pictures fit {says} better" in checked(capture)[0].concern
+    assert f"the images fit {says} better" in checked(capture)[0].concern
 
 
 def test_poses_in_reverse_are_found(written):
     capture = replace(written, world_from_cam=written.world_from_cam[::-1])
-    assert "the pictures fit the poses in reverse better" in checked(capture)[0].concern
+    assert "the images fit the poses in reverse better" in checked(capture)[0].concern
 
 
 def test_pictures_sorted_as_text_are_found(written, tmp_path):
@@ -154,9 +154,9 @@ def test_pictures_sorted_as_text_are_found(written, tmp_path):
         images[-1].symlink_to(image)
     order = sorted(range(40), key=lambda row: images[row].name)
     capture = replace(written, images=tuple(images), world_from_cam=written.world_from_cam[np.argsort(order)])
-    # Poses were written for pictures in the order of text, and are read for pictures in the order of numbers.
+    # Poses were written for images in the order of text, and are read for images in the order of numbers.
     capture = replace(capture, world_from_cam=written.world_from_cam[order])
-    assert "the pictures fit the pictures sorted as text better" in checked(capture)[0].concern
+    assert "the images fit the images sorted as text better" in checked(capture)[0].concern
 
 
 def test_the_right_order_stays(written, matches):
@@ -225,7 +225,7 @@ def test_the_peak_lies_between_the_focal_lengths_that_were_tried():
 def test_the_focal_length_of_real_frames_is_that_of_the_color_camera():
     """525 px at a width of 640, as data/cameras.py has it, not the depth sensor's 585; training frames alone.
 
-    Takes ten seconds: 700 keypoints in each of 70 real pictures.
+    Takes ten seconds: 700 keypoints in each of 70 real images.
     """
     capture = read_capture(REDKITCHEN)
     capture = selected(capture, [row for row, split in enumerate(capture.split) if split == "train"])

@@ -1,4 +1,4 @@
-"""A walk whose pictures can be matched: the axis check of each format that is written down here."""
+"""A walk whose images can be matched: the axis check of each format that is written down here."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INSIDE_M = ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))
 
 @dataclass(frozen=True)
 class Walk:
-    """Pictures of a pinhole of known poses; pixels count from the centre of the top-left one."""
+    """Images of a pinhole of known poses; pixels count from the centre of the top-left one."""
 
     world_from_cam: NDArray[np.float64]
     pngs: list[bytes]
@@ -34,7 +34,7 @@ class Walk:
             (folder / name).write_bytes(data)
 
     def is_agreed(self, capture: Capture) -> None:
-        """Check poses, and that pictures agree with them and the camera as they were read, and no other way."""
+        """Check poses, and that images agree with them and the camera as they were read, and no other way."""
         np.testing.assert_allclose(capture.world_from_cam, self.world_from_cam, atol=1e-6)
         shares = by_convention(find_matches(capture, motion_of(capture)), capture.world_from_cam)
         as_read = shares.pop(AS_READ)

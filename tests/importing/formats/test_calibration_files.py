@@ -1,4 +1,4 @@
-"""The layout of DSAC*, ACE and Wayspots: a camera for each picture, and every bad input named.
+"""The layout of DSAC*, ACE and Wayspots: a camera for each image, and every bad input named.
 
 Guess, made before the loader was looked up: the principal point counts from the image's corner (right: it is scaled as
 the focal length is).

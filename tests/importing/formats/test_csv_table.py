@@ -217,7 +217,7 @@ def test_several_tables_or_none(folder, recording, refused):
 
 
 def test_real_poses_are_those_of_the_table(recording, tmp_path):
-    """Rows of the real 7-Scenes table, with pictures of our own."""
+    """Rows of the real 7-Scenes table, with images of our own."""
     table = Path(__file__).parents[4] / "shared" / "data" / "trajectories" / "7scenes.csv"
     if not table.is_file():
         pytest.skip(f"no real data at {table}")

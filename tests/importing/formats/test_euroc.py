@@ -37,7 +37,7 @@ def sensor(matrix=BODY_FROM_CAM, **more) -> str:
 
 
 def truth(world_from_body, header=HEADER) -> str:
-    """Ten times as many poses as pictures; between these the body stands still, so that the nearest time is right."""
+    """Ten times as many poses as images; between these the body stands still, so that the nearest time is right."""
     wxyz = np.roll(Rotation.from_matrix(world_from_body[:, :3, :3]).as_quat(), 1, axis=1)
     rows = [
         ",".join([str(FIRST_NS + row * STEP_NS + k * STEP_NS // 10), *map(repr, (*p, *q)), "0.1"])

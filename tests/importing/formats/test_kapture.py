@@ -27,7 +27,7 @@ def numbers(pose) -> str:
 
 
 def write_part(folder, walk, rows, device_from_world, camera=None, device="cam0", stamps=None, names=None):
-    """Write a kapture of some of the walk's pictures."""
+    """Write a kapture of some of the walk's images."""
     sensors = folder / "sensors"
     names = names or [f"left/{row:05d}.png" for row in rows]
     stamps = stamps or [str(FIRST + 100 * row) for row in rows]

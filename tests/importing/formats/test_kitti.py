@@ -126,7 +126,7 @@ def test_several_sequences_are_several_worlds(kitti, refused):
         ("sequences/07/calib.txt", "P2: inf 0 32 0 0 9 24 0 0 0 1 0\n", "has no line 'P2:' of 12 finite numbers"),
         ("sequences/07/times.txt", "0\n1\n", "times.txt: has 2 times for 6 poses"),
         ("sequences/07/times.txt", "0\n1 2\n", "times.txt, line 2: is no line 'seconds'"),
-        ("sequences/07/image_2/000000.png", "no picture", "000000.png: image cannot be decoded"),
+        ("sequences/07/image_2/000000.png", "no image", "000000.png: image cannot be decoded"),
     ],
 )
 def test_damage_is_named_in_one_line(kitti, refused, file, content, says):

@@ -79,7 +79,7 @@ def test_pictures_without_a_camera_have_none_at_all(source):
     edit(source / "intrinsics.txt", lambda lines: lines[1:])
     capture = read_capture(source)
     assert (capture.cameras, capture.camera_of) == ({}, None)
-    assert capture.choices["cameras"] == "none: intrinsics.txt does not name every picture"
+    assert capture.choices["cameras"] == "none: intrinsics.txt does not name every image"
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ LENS = {"f": float(K[0, 0])}
 
 @pytest.fixture
 def write(walk, tmp_path):
-    """Write a walk's pictures and a document; the camera's middle is the walk's."""
+    """Write a walk's images and a document; the camera's middle is the walk's."""
     names = [f"DJI_{row:04d}.png" for row in range(len(walk.pngs))]
     walk.write(tmp_path / "photos", names)
 

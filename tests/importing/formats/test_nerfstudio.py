@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 32, 24
 
 @pytest.fixture
 def write(tmp_path):
-    """Write a capture of tiny pictures; ``told`` goes beside its frames, ``frame`` into each."""
+    """Write a capture of tiny images; ``told`` goes beside its frames, ``frame`` into each."""
 
     def write(names=("images/a_1.png", "images/a_2.png"), absent=(), frame=None, file="transforms.json", **told):
         rng = np.random.default_rng(5)
@@ -360,7 +360,7 @@ def test_more_frames_than_a_scene_may_have(write, tmp_path, monkeypatch):
 def test_no_image_can_be_decoded(write, tmp_path):
     write(**{key: value for key, value in FOCAL.items() if key not in "wh"})
     for path in (tmp_path / "images").iterdir():
-        path.write_bytes(b"no picture")
+        path.write_bytes(b"no image")
     with pytest.raises(InputError, match="neither it nor any other of 2 images can be decoded"):
         read_capture(tmp_path)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recorded import FRAMES, Recording
 
-from mambaloc.importing.formats.timing import picture_stamps, stamps_of
+from mambaloc.importing.formats.timing import image_stamps, stamps_of
 from mambaloc.importing.registry import read_capture
 from mambaloc.importing.world import in_its_world
 
@@ -84,7 +84,7 @@ def test_headers_of_trajectories_as_programs_write_them(recording, tmp_path, hea
 
 
 def test_names_in_quotes(recording, tmp_path):
-    names = [f"my picture {row}.jpg" for row in range(FRAMES)]
+    names = [f"my image {row}.jpg" for row in range(FRAMES)]
     lines = [f'"{name}" {line}' for name, line in zip(names, sevens(recording, "twv"), strict=True)]
     source = write(recording, tmp_path, ["# image x y z qw qx qy qz", *lines], names=names)
     np.testing.assert_allclose(read_capture(source).world_from_cam, recording.world_from_cam, atol=1e-9)
@@ -199,5 +199,5 @@ def test_words_that_are_no_times(words):
 
 
 def test_pictures_that_are_counted_have_no_times(tmp_path):
-    assert picture_stamps([tmp_path / f"{row:06d}.jpg" for row in range(9)]) is None
-    assert picture_stamps([tmp_path / f"{row * 33333}.jpg" for row in range(9)]).unit == "us"
+    assert image_stamps([tmp_path / f"{row:06d}.jpg" for row in range(9)]) is None
+    assert image_stamps([tmp_path / f"{row * 33333}.jpg" for row in range(9)]).unit == "us"

@@ -1,8 +1,8 @@
 """RealityScan's table: angles by hand and against rotations about axes, lenses against OpenCV, every bad input named.
 
 Guesses, made before they were looked up: the angles are heading clockwise from north, then pitch, then roll of a camera
-that looks down at zero (right); roll is about the optical axis (wrong: about the picture's up, a drone's way ahead); px
-and py are in millimetres of film, as f is (wrong: shares of the longer side); t1 and t2 are OpenCV's p1 and p2, as in
+that looks down at zero (right); roll is about the optical axis (wrong: about the image's up, a drone's way ahead); px
+and py are in millimetres of video, as f is (wrong: shares of the longer side); t1 and t2 are OpenCV's p1 and p2, as in
 nerfstudio's reader (wrong: the other way round).
 """
 
@@ -36,7 +36,7 @@ def row(name, pose, lens) -> str:
 
 @pytest.fixture
 def lens(walk):
-    """The walk's camera: f of a film 36 mm long, and its centre's shares of 320 from the middle."""
+    """The walk's camera: f of a video 36 mm long, and its centre's shares of 320 from the middle."""
     fx, cx, cy = walk.intrinsics[0, 0], walk.intrinsics[0, 2], walk.intrinsics[1, 2]
     return [float(fx * 36 / 320), float((cx + 0.5 - 160) / 320), float((cy + 0.5 - 120) / 320), *[0.0] * 6]
 
@@ -69,7 +69,7 @@ def test_a_table_is_read_and_its_pictures_agree(write, walk, header):
         ("90,0,0", (0, 0, -1), (-1, 0, 0)),  # east up: clockwise
         ("0,90,0", (0, 1, 0), (0, 0, -1)),  # level, towards north
         ("90,90,0", (1, 0, 0), (0, 0, -1)),  # level, towards east
-        ("0,90,90", (-1, 0, 0), (0, 0, -1)),  # level, turned about the picture's up from north to west
+        ("0,90,90", (-1, 0, 0), (0, 0, -1)),  # level, turned about the image's up from north to west
     ],
 )
 def test_what_angles_mean(write, angles, forward, down):
@@ -100,7 +100,7 @@ def test_the_lens_is_opencvs_with_its_tangential_terms_swapped(write, walk, lens
 
 
 def test_each_distinct_lens_is_a_camera_and_a_damaged_picture_stays_for_the_checks(write, tmp_path):
-    (tmp_path / "photos/IMG_0002.png").write_bytes(b"no picture")
+    (tmp_path / "photos/IMG_0002.png").write_bytes(b"no image")
     rows = [f"IMG_000{n}.png,{n},0,0,0,90,0,{30 + n // 2}" for n in range(4)]
     capture = write(text="\n".join([SHORT, *rows]))
     assert capture.camera_of == ("camera-1", "camera-1", "camera-2", "camera-2")

@@ -32,7 +32,7 @@ BASE_FROM_CAM[:3, 3] = 0.3, 0.02, 0.5
 
 @pytest.fixture(scope="module")
 def drive():
-    """Times of pictures, between those of poses; of the base at those; of the camera by SciPy; pictures there."""
+    """Times of images, between those of poses; of the base at those; of the camera by SciPy; images there."""
     pose_ns = FIRST_NS + STEP_NS // 2 * np.arange(2 * FRAMES + 2)
     base = smooth_trajectory(len(pose_ns), seed=5, inside_m=INSIDE_M, step_deg=3.0) @ np.linalg.inv(BASE_FROM_CAM)
     taken_ns = FIRST_NS + STEP_NS * np.arange(FRAMES) + 11_000_000
@@ -130,7 +130,7 @@ def test_lenses_are_opencvs(record, drive, model, coefficients):
 
 
 def test_gaps_are_told_and_their_pictures_left_out(record, drive):
-    """Poses pause for 0.7 s, and end before the last picture."""
+    """Poses pause for 0.7 s, and end before the last image."""
     kept = [row for row in range(len(drive[0])) if not 8 < row < 22 and row < 27]
 
     def write(bag):
@@ -138,7 +138,7 @@ def test_gaps_are_told_and_their_pictures_left_out(record, drive):
         write_poses(bag, (drive[0][kept], drive[1][kept]))
 
     path = record(write)
-    with pytest.warns(InputWarning, match=r"drive: 8 pictures have no pose: 7 in gaps of odom -> base_link over 0.5 s"):
+    with pytest.warns(InputWarning, match=r"drive: 8 images have no pose: 7 in gaps of odom -> base_link over 0.5 s"):
         capture = read_capture(path)
     numbers = {int(image.stem) for image in capture.images}
     assert not numbers & {4, 5, 6, 7, 8, 9, 10, 13}
@@ -152,11 +152,11 @@ def test_gaps_are_told_and_their_pictures_left_out(record, drive):
 def test_pictures_are_held_one_by_one(record, drive, monkeypatch):
     alive: list[weakref.ref] = []
     most = 0
-    pictures_of = ros_bag.pictures_of
+    images_of = ros_bag.images_of
 
     def watched(bag, topic):
         nonlocal most
-        for picture in pictures_of(bag, topic):
+        for picture in images_of(bag, topic):
             alive.append(weakref.ref(picture))
             most = max(most, sum(ref() is not None for ref in alive))
             yield picture
@@ -188,7 +188,7 @@ def islands(bag, drive):
         (islands, None, "no transform links the frames 'base_link' and 'camera_optical'"),
         (write_pictures, None, "nothing says where the camera 'camera_optical' was"),
         (lambda bag, drive: (write_pictures(bag, drive), write_poses(bag, drive, "pose")), None, "--pose-frame"),
-        (lambda bag, drive: write_poses(bag, drive), None, "has no topic of pictures"),
+        (lambda bag, drive: write_poses(bag, drive), None, "has no topic of images"),
         (
             lambda bag, drive: (
                 write_pictures(bag, drive, distortion_model="thin_prism", d=[0.1] * 5),
@@ -200,7 +200,7 @@ def islands(bag, drive):
         (
             lambda bag, drive: (write_pictures(bag, drive), write_poses(bag, (drive[0] - 10**12, drive[1]))),
             None,
-            "no picture of /eye/image_raw has a pose; 14 pictures have no pose: 14 before the first or after the last",
+            "no image of /eye/image_raw has a pose; 14 images have no pose: 14 before the first or after the last",
         ),
     ],
 )

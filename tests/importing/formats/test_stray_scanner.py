@@ -1,4 +1,4 @@
-"""Stray Scanner: a film, its poses in OpenCV's axes, and depth; every damage named in one line."""
+"""Stray Scanner: a video, its poses in OpenCV's axes, and depth; every damage named in one line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mambaloc.importing.checks.matching import find_matches
 from mambaloc.importing.formats.stray_scanner import read_stray_scanner
 from mambaloc.importing.motion import motion_of
 from mambaloc.importing.registry import read_capture
-from mambaloc.importing.undistort.pictures import selected
+from mambaloc.importing.undistort.images import selected
 from mambaloc.rendering import default_intrinsics, furnished_room, render, smooth_trajectory
 
 SIZE, FRAMES = (320, 240), 40
@@ -27,7 +27,7 @@ FIRST_S = 81234.5671
 
 @pytest.fixture(scope="module")
 def walk():
-    """Poses, and what a camera sees there: pictures and depth in millimetres at a quarter of their size."""
+    """Poses, and what a camera sees there: images and depth in millimetres at a quarter of their size."""
     room, intrinsics = furnished_room(INSIDE_M, seed=0, px_per_m=140), default_intrinsics(SIZE)
     poses = smooth_trajectory(FRAMES, seed=5, inside_m=INSIDE_M, step_deg=2.0)
     seen = [render(room, intrinsics, pose, SIZE) for pose in poses]
@@ -155,7 +155,7 @@ def test_each_frame_has_its_own_lens_in_newer_versions(source, walk):
 
 
 def test_frames_are_those_that_the_film_stores(source, walk):
-    """The matrix is the sensor's: a film that asks to be shown upright is not turned."""
+    """The matrix is the sensor's: a video that asks to be shown upright is not turned."""
     data = bytearray((source / "rgb.mp4").read_bytes())
     at = data.index(b"tkhd") + 4 + 40
     assert struct.unpack_from(">9i", data, at) == (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
@@ -196,7 +196,7 @@ def test_a_row_of_no_pose_is_nan(source, walk):
         ("camera_matrix.csv", "1, 2\n3, 4\n", "is no 3x3 matrix"),
         ("camera_matrix.csv", "1,0,x\n0,1,3\n0,0,1\n", "is no 3x3 matrix"),
         ("camera_matrix.csv", "1600,0,960\n0,1600,720\n0,0,1\n", "principal point 960, 720 is far from the centre"),
-        ("rgb.mp4", "no film", "rgb.mp4: cannot be opened"),
+        ("rgb.mp4", "no video", "rgb.mp4: cannot be opened"),
     ],
 )
 def test_what_is_damaged_is_named(source, refused, file, content, says):

@@ -1,4 +1,4 @@
-"""Pictures without poses: frames chosen for sharpness and movement, and posed where they were taken."""
+"""Images without poses: frames chosen for sharpness and movement, and posed where they were taken."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FILM_FRAMES = 48
 
 @pytest.fixture(scope="module")
 def wall():
-    """A wide picture with texture of several sizes, to move along."""
+    """A wide image with texture of several sizes, to move along."""
     rng = np.random.default_rng(0)
     octaves = [rng.integers(0, 256, (6 * k, 30 * k, 3)).astype(np.float32) for k in (1, 3, 10)]
     layers = [cv2.resize(octave, (1800, 360), interpolation=cv2.INTER_CUBIC) for octave in octaves]
@@ -73,7 +73,7 @@ def test_the_sharpest_of_each_stretch_is_chosen(wall):
     blurred = {number for number in range(len(shifts)) if number % 3}
     chosen = [int(frame.name) for frame in choose_frames(film(wall, shifts, blurred))]
     assert len(chosen) > 10
-    assert not blurred & set(chosen[:-1])  # the last stretch ends with the film, after a frame or two
+    assert not blurred & set(chosen[:-1])  # the last stretch ends with the video, after a frame or two
 
 
 def test_a_jump_is_followed(wall):
@@ -111,7 +111,7 @@ def errors(capture, true):
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
-    """A film of a room, where each of its frames and others after it was taken, and the pictures of all."""
+    """A video of a room, where each of its frames and others after it was taken, and the images of all."""
     poses = smooth_trajectory(72, seed=5, inside_m=INSIDE_M, step_deg=1.5)
     room = furnished_room(INSIDE_M, seed=0, px_per_m=140)
     pictures = [render(room, default_intrinsics(SIZE), pose, SIZE)[0] for pose in poses]
@@ -171,7 +171,7 @@ def test_too_few_frames_are_refused_with_advice(tmp_path, refused):
     for number in range(3, 8):
         cv2.imwrite(str(tmp_path / f"{number}.jpg"), grey)
     refused(read_structure, tmp_path, "only 0 of 8 frames could be placed", "sideways")
-    (tmp_path / "7.jpg").write_bytes(b"no picture")
+    (tmp_path / "7.jpg").write_bytes(b"no image")
     refused(read_structure, tmp_path, "7.jpg: image cannot be decoded")
 
 
@@ -244,9 +244,9 @@ def test_a_model_is_read_with_opencv_loaded_first():
 
 def test_what_is_no_film(tmp_path, refused):
     pytest.importorskip("pycolmap", reason="structure from motion is pycolmap's, the extra [colmap]")
-    (tmp_path / "a.mp4").write_bytes(b"no film")
+    (tmp_path / "a.mp4").write_bytes(b"no video")
     refused(read_structure, tmp_path / "a.mp4", "cannot be opened")
-    refused(read_structure, tmp_path / "none", "none holds a picture")
+    refused(read_structure, tmp_path / "none", "none holds an image")
 
 
 def test_without_pycolmap_the_extra_is_named(tmp_path, refused, monkeypatch):

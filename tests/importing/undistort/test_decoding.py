@@ -1,4 +1,4 @@
-"""Pictures of an import are those that their poses mean, against Pillow; black and white are the same for all."""
+"""Images of an import are those that their poses mean, against Pillow; black and white are the same for all."""
 
 import io
 from dataclasses import replace
@@ -18,14 +18,14 @@ from mambaloc.errors import InputError
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.checks.sanity import check_pixels
 from mambaloc.importing.undistort.decoding import counts_of, decoding_of
-from mambaloc.importing.undistort.pictures import write_pictures
+from mambaloc.importing.undistort.images import write_images
 from mambaloc.mapping.posed import with_cameras
 
 KINDS = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP", "jpeg": "JPEG"}
 
 
 def tagged(folder: Path, name: str, size: tuple[int, int], tag: int, seed: int = 0) -> Path:
-    """A picture of coarse noise, which JPEG keeps, with an orientation."""
+    """An image of coarse noise, which JPEG keeps, with an orientation."""
     coarse = np.random.default_rng(seed).integers(0, 256, (4, 4, 3), dtype=np.uint8)
     exif = Image.Exif()
     exif[0x0112] = tag
@@ -52,12 +52,12 @@ def captured(kind: str, images: list[Path], camera: tuple[int, int] | None) -> C
     st.sampled_from(["stored", "upright", None]),
 )
 def test_any_orientation_in_any_format(tags, size, kind, shaped_as):
-    """Poses mean stored pixels, unless cameras are shaped as the upright pictures alone are."""
+    """Poses mean stored pixels, unless cameras are shaped as the upright images alone are."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         images = [tagged(folder, f"{row}.{suffix}", size, tag, row) for row, (tag, suffix) in enumerate(tags)]
         camera = {"stored": size, "upright": size[::-1], None: None}[shaped_as]
-        written = write_pictures(captured(kind, images, camera), folder / "out")
+        written = write_images(captured(kind, images, camera), folder / "out")
         if size[0] != size[1] and shaped_as == "upright":  # which those with a tag of 1 to 4 are not
             images = [image for image, (tag, _) in zip(images, tags, strict=True) if tag >= 5]
             expected = [ImageOps.exif_transpose(Image.open(image)) for image in images]
@@ -76,31 +76,31 @@ def test_any_orientation_in_any_format(tags, size, kind, shaped_as):
 
 
 def test_one_picture_that_lies_says_what_the_others_mean(tmp_path):
-    """A camera as tall as an upright picture: poses mean upright pixels, those of a square picture, too."""
+    """A camera as tall as an upright image: poses mean upright pixels, those of a square image, too."""
     images = [tagged(tmp_path, "lying.jpg", (32, 24), 6), tagged(tmp_path, "square.jpg", (24, 24), 3)]
     capture = captured("nerfstudio", images, (24, 32))
     lens = Camera(24, 24, (30.0, 30.0), (11.5, 11.5))
     capture = replace(capture, cameras={**capture.cameras, "two": lens}, camera_of=("one", "two"))
     assert decoding_of(capture).upright
-    written = write_pictures(capture, tmp_path / "out")
+    written = write_images(capture, tmp_path / "out")
     expected = np.asarray(Image.open(images[1]))[::-1, ::-1].astype(int)
     assert np.abs(np.asarray(Image.open(written.capture.images[1])).astype(int) - expected).mean() < 5
-    said = "upright, as the cameras' sizes say: 2 of 2 pictures (such as lying.jpg) were turned"
+    said = "upright, as the cameras' sizes say: 2 of 2 images (such as lying.jpg) were turned"
     assert written.capture.choices["pixels"] == said
 
 
 def test_pictures_that_were_decided_differently_are_counted_apart(tmp_path):
-    """Two phones in one table: the camera of one is shaped as its stored pictures, that of the other is not."""
+    """Two phones in one table: the camera of one is shaped as its stored images, that of the other is not."""
     images = [tagged(tmp_path, f"{row}.jpg", (32, 24), tag, row) for row, tag in enumerate([6, 8, 1, 6])]
     capture = captured("csv", images, (32, 24))
     tall = Camera(24, 32, (30.0, 30.0), (11.5, 15.5))
     capture = replace(capture, cameras={**capture.cameras, "tall": tall}, camera_of=("one", "tall", "one", "tall"))
-    written = write_pictures(capture, tmp_path / "out")
+    written = write_images(capture, tmp_path / "out")
     assert [Image.open(image).size for image in written.capture.images] == [(32, 24), (24, 32), (32, 24), (24, 32)]
     said = written.capture.choices["pixels"]
-    assert "2 of 4 pictures (such as 1.jpg) were turned" in said
-    assert "1 of 4 pictures (such as 0.jpg) have an EXIF orientation, dropped" in said
-    assert check_pixels(written.decoding).concern.startswith("1 pictures have an EXIF orientation")
+    assert "2 of 4 images (such as 1.jpg) were turned" in said
+    assert "1 of 4 images (such as 0.jpg) have an EXIF orientation, dropped" in said
+    assert check_pixels(written.decoding).concern.startswith("1 images have an EXIF orientation")
 
 
 def test_a_training_and_a_map_refuse_a_picture_that_may_be_either_way_round(tmp_path):

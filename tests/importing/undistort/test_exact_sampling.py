@@ -1,4 +1,4 @@
-"""Pictures are sampled where the lens says, to far below OpenCV 4's thirty-second of a pixel."""
+"""Images are sampled where the lens says, to far below OpenCV 4's thirty-second of a pixel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mambaloc.runtime.undistortion import sampled_at, undistorted
 def test_samples_are_not_rounded_to_a_thirty_second_of_a_pixel():
     """Guess: ``cv2.remap`` is exact. 4.12 rounds places to 1/32 pixel, up to 4 of 255 levels here; 5.0 does not.
 
-    ``cv2.undistort`` still does in 5.0, so pictures go through maps of our own.
+    ``cv2.undistort`` still does in 5.0, so images go through maps of our own.
     """
     stripes = np.tile(np.array([0, 255], np.uint8), (40, 64))
     shifts_px = np.linspace(0, 1, 101)[:-1]

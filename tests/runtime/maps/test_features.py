@@ -61,7 +61,7 @@ def test_intrinsics_follow_a_resize_as_those_of_torch_do():
     [np.eye(3), np.zeros((3, 3)), np.full((3, 3), np.nan), np.eye(4), INTRINSICS * 4, np.diag((150.0, 150.0, 1))],
 )
 def test_intrinsics_of_another_picture_are_refused(wrong):
-    with pytest.raises(InputError, match=r"cannot be the camera of a picture of 160x120") as error:
+    with pytest.raises(InputError, match=r"cannot be the camera of an image of 160x120") as error:
         detect_features(_blob(80, 60, 3), wrong, 1)
     assert "\n" not in str(error.value)
 

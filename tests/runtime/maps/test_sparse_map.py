@@ -86,7 +86,7 @@ CHANGES = {
     "views of fewer key frames": {"views": np.zeros((9, 1), np.uint8)},
     "no size": {"size": np.array([0, 120])},
     "a number for intrinsics": {"intrinsics": np.array(3.0)},
-    "intrinsics of another picture": {"intrinsics": np.eye(3)},
+    "intrinsics of another image": {"intrinsics": np.eye(3)},
 }
 
 

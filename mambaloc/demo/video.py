@@ -1,4 +1,4 @@
-"""A short film of the embedded scene, taken along a way that no training frame is on, with its true poses."""
+"""A short video of the embedded scene, taken along a way that no training frame is on, with its true poses."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from mambaloc.rendering import GENERATOR_VERSION, default_intrinsics, embedded_r
 from mambaloc.runtime.rotations import quaternion_from_matrix
 from mambaloc.user_cache import made_once
 
-FILM_FILE, POSES_FILE = "film.webm", "film.json"
+VIDEO_FILE, POSES_FILE = "film.webm", "film.json"
 _FRAMES, _FPS, _SEED = 240, 15, 7
 _SIZE = (320, 240)
 
 
-def embedded_film() -> Path:
+def embedded_video() -> Path:
     """The folder of ``film.webm`` and ``film.json``, rendered into the user's cache on first use (half a minute).
 
     ``film.json`` holds ``file``, ``fps`` and ``poses``, x y z qw qx qy qz a frame: ``world_from_cam``, wxyz.
@@ -39,17 +39,17 @@ def _take(folder: Path) -> None:
     walk = embedded_walk(_FRAMES, _SEED, start_deg=135.0, step_deg=1.2)
     # VP8: nearly every browser plays it, and OpenCV's wheels hold its encoder.
     with _quiet():
-        writer = cv2.VideoWriter(str(folder / FILM_FILE), cv2.VideoWriter.fourcc(*"VP80"), _FPS, _SIZE)
+        writer = cv2.VideoWriter(str(folder / VIDEO_FILE), cv2.VideoWriter.fourcc(*"VP80"), _FPS, _SIZE)
     if not writer.isOpened():
-        raise InputError(f"{FILM_FILE}: this OpenCV writes no VP8; install opencv-python-headless, or give --film")
+        raise InputError(f"{VIDEO_FILE}: this OpenCV writes no VP8; install opencv-python-headless, or give --video")
     for world_from_cam in track(walk, "filming the embedded scene", console=Console(stderr=True), transient=True):
         rgb, _ = render(room, intrinsics, world_from_cam, _SIZE)
         writer.write(cv2.cvtColor(sensor(rgb, rng), cv2.COLOR_RGB2BGR))
     writer.release()
-    if (taken := int(cv2.VideoCapture(str(folder / FILM_FILE)).get(cv2.CAP_PROP_FRAME_COUNT))) != _FRAMES:
-        raise InputError(f"{folder.parent}: took {taken} of {_FRAMES} frames of a film; is the disk full?")
+    if (taken := int(cv2.VideoCapture(str(folder / VIDEO_FILE)).get(cv2.CAP_PROP_FRAME_COUNT))) != _FRAMES:
+        raise InputError(f"{folder.parent}: took {taken} of {_FRAMES} frames of a video; is the disk full?")
     poses = [[*pose[:3, 3], *quaternion_from_matrix(pose[:3, :3])] for pose in walk]
-    told = {"file": FILM_FILE, "fps": _FPS, "poses": np.round(poses, 5).tolist()}
+    told = {"file": VIDEO_FILE, "fps": _FPS, "poses": np.round(poses, 5).tolist()}
     (folder / POSES_FILE).write_text(json.dumps(told) + "\n", encoding="utf-8")
 
 

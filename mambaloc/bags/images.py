@@ -1,6 +1,6 @@
-"""Pictures of a bag: ``sensor_msgs/Image`` and ``CompressedImage``, with the camera that ``CameraInfo`` describes.
+"""Images of a bag: ``sensor_msgs/Image`` and ``CompressedImage``, with the camera that ``CameraInfo`` describes.
 
-Encodings are those of ``sensor_msgs/image_encodings.hpp``. Compressed pictures are files of JPEG or PNG. Intrinsics are
+Encodings are those of ``sensor_msgs/image_encodings.hpp``. Compressed images are files of JPEG or PNG. Intrinsics are
 OpenCV's: the centre of the top-left pixel is (0, 0), and distortion models are ``plumb_bob``, ``rational_polynomial``
 and ``equidistant`` (``sensor_msgs/distortion_models.hpp``). A rectified topic has the projection matrix P instead.
 """
@@ -40,15 +40,15 @@ _DEPTH = ("16UC1", "32FC1")
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A message with a picture.
+class BagImage:
+    """A message with an image.
 
     Args:
         number: of the message in its topic, from 0.
         ns: when it was taken, in nanoseconds.
         frame: the camera's optical frame.
-        image: RGB (H, W, 3); or, of a picture that is damaged, the rule that it breaks.
-        file: the picture's JPEG or PNG; None where it was recorded raw.
+        image: RGB (H, W, 3); or, of an image that is damaged, the rule that it breaks.
+        file: the image's JPEG or PNG; None where it was recorded raw.
     """
 
     number: int
@@ -60,7 +60,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class BagCamera:
-    """What ``CameraInfo`` says of a camera, in pixels of its pictures.
+    """What ``CameraInfo`` says of a camera, in pixels of its images.
 
     Args:
         size: width and height.
@@ -75,8 +75,8 @@ class BagCamera:
     coefficients: tuple[float, ...]
 
 
-def picture_topic(bag: Bag, asked: str | None = None) -> str:
-    """The topic of a bag's pictures: the one there is, or the one of several that has a camera, unless one is named.
+def image_topic(bag: Bag, asked: str | None = None) -> str:
+    """The topic of a bag's images: the one there is, or the one of several that has a camera, unless one is named.
 
     Topics of depth are none of them.
 
@@ -87,14 +87,14 @@ def picture_topic(bag: Bag, asked: str | None = None) -> str:
     if asked is not None:
         if asked not in every:
             there = ", ".join(every) or "none"
-            raise InputError(f"--topic {asked}: {bag.path} has no pictures there. Its topics of pictures: {there}.")
+            raise InputError(f"--topic {asked}: {bag.path} has no images there. Its topics of images: {there}.")
         return asked
     if not every:
-        raise InputError(f"{bag.path}: has no topic of pictures (Image or CompressedImage). Record the camera's.")
+        raise InputError(f"{bag.path}: has no topic of images (Image or CompressedImage). Record the camera's.")
     known = [topic for topic in every if camera_topic(bag, topic) is not None]
     found = every if len(every) == 1 else known
     if len(found) != 1:
-        raise InputError(f"{bag.path}: has pictures in {', '.join(every)}. Choose one with --topic NAME.")
+        raise InputError(f"{bag.path}: has images in {', '.join(every)}. Choose one with --topic NAME.")
     return found[0]
 
 
@@ -104,14 +104,14 @@ def _is_depth(bag: Bag, topic: str) -> bool:
 
 
 def camera_topic(bag: Bag, topic: str) -> str | None:
-    """The topic of ``CameraInfo`` beside that of pictures, as ``image_transport`` names it; None without one."""
+    """The topic of ``CameraInfo`` beside that of images, as ``image_transport`` names it; None without one."""
     base = topic.removesuffix("/compressed")
     name = f"{base.rpartition('/')[0]}/camera_info"
     return name if bag.topics.get(name) == CAMERA else None
 
 
 def camera_of(bag: Bag, topic: str) -> BagCamera | None:
-    """The camera of a topic's pictures; None where the bag does not have it.
+    """The camera of a topic's images; None where the bag does not have it.
 
     Raises:
         InputError: where it is not calibrated, or its distortion is of no known model.
@@ -142,11 +142,11 @@ def _numbers(told: Any, name: str) -> NDArray[np.float64]:
     return np.asarray(getattr(told, name, None) if hasattr(told, name) else getattr(told, name.upper()), np.float64)
 
 
-def pictures_of(bag: Bag, topic: str) -> Iterator[Picture]:
-    """A topic's pictures, one at a time, in the order in which they were recorded.
+def images_of(bag: Bag, topic: str) -> Iterator[BagImage]:
+    """A topic's images, one at a time, in the order in which they were recorded.
 
     Raises:
-        InputError: for an encoding that is not read, pictures without a time, or of several frames.
+        InputError: for an encoding that is not read, images without a time, or of several frames.
     """
     frame = None
     for number, (_, message) in enumerate(bag.messages([topic])):
@@ -154,23 +154,23 @@ def pictures_of(bag: Bag, topic: str) -> Iterator[Picture]:
         frame = named if frame is None else frame
         if named != frame:
             raise InputError(
-                f"{bag.path}: {topic} has pictures of the frames {frame!r} and {named!r}. Record a topic a camera."
+                f"{bag.path}: {topic} has images of the frames {frame!r} and {named!r}. Record a topic a camera."
             )
         if ns <= 0:
             raise InputError(f"{bag.path}: {topic}, message {number}: its header has no time. Record with stamps.")
         if hasattr(message, "format"):
             data = message.data.tobytes()
-            yield Picture(number, ns, frame, decode_image(data, upright=False), data)
+            yield BagImage(number, ns, frame, decode_image(data, upright=False), data)
         else:
-            yield Picture(number, ns, frame, _decoded(message, f"{bag.path}: {topic}"))
+            yield BagImage(number, ns, frame, _decoded(message, f"{bag.path}: {topic}"))
 
 
 def _decoded(message: Any, where: str) -> Image | str:
-    """A raw picture as RGB (H, W, 3), or the rule that it breaks."""
+    """A raw image as RGB (H, W, 3), or the rule that it breaks."""
     encoding, height, width = message.encoding, int(message.height), int(message.width)
     if encoding not in _CHANNELS:
         remedy = "Record 8 bits (mono8, rgb8)." if "16" in encoding or "32" in encoding else "Record rgb8 or JPEG."
-        raise InputError(f"{where}: has pictures encoded as {encoding!r}, which is not read. {remedy}")
+        raise InputError(f"{where}: has images encoded as {encoding!r}, which is not read. {remedy}")
     channels, step = _CHANNELS[encoding], int(message.step)
     if not (height and width and step >= width * channels and len(message.data) >= height * step):
         return f"image of {width}x{height} has {len(message.data)} bytes, less than it needs"

@@ -1,4 +1,4 @@
-"""Pictures of a bag: each encoding against OpenCV or the pixels themselves, cameras by hand, and topics to choose."""
+"""Images of a bag: each encoding against OpenCV or the pixels themselves, cameras by hand, and topics to choose."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bag_writing import FIRST_NS, KINDS, png, recording_in
 
-from mambaloc.bags.pictures import camera_of, camera_topic, picture_topic, pictures_of
+from mambaloc.bags.images import camera_of, camera_topic, image_topic, images_of
 from mambaloc.bags.reading import is_bag, open_bag
 from mambaloc.errors import InputError
 
@@ -33,7 +33,7 @@ def record(tmp_path):
 
 def only(path):
     with open_bag(path) as bag:
-        (picture,) = pictures_of(bag, picture_topic(bag))
+        (picture,) = images_of(bag, image_topic(bag))
     return picture
 
 
@@ -61,7 +61,7 @@ def test_colors_are_kept(record, rgb, kind, pad):
     path = record(write, kind)
     assert is_bag(path)
     with open_bag(path) as bag:
-        found = list(pictures_of(bag, picture_topic(bag)))
+        found = list(images_of(bag, image_topic(bag)))
     assert [(each.number, each.ns, each.frame) for each in found] == [(k, FIRST_NS + k, "eye") for k in range(5)]
     for each in found:
         np.testing.assert_array_equal(each.image, rgb)
@@ -108,7 +108,7 @@ def test_compressed_pictures_are_decoded_and_their_files_kept(record, rgb, kind)
             bag.compressed("/eye/compressed", FIRST_NS + at, "eye", file)
 
     with open_bag(record(write, kind)) as bag:
-        first, second, third = pictures_of(bag, picture_topic(bag))
+        first, second, third = images_of(bag, image_topic(bag))
     np.testing.assert_array_equal(first.image, cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB))
     np.testing.assert_array_equal(second.image, rgb)
     assert (first.file, second.file, third.image) == (jpeg, png(rgb), "image is truncated")
@@ -130,8 +130,8 @@ def test_a_picture_with_too_few_bytes_is_named(record, rgb):
         (lambda bag, rgb: bag.image("/a", FIRST_NS, "eye", rgb[..., 0].astype(np.uint16), "mono16"), "'mono16'"),
         (lambda bag, rgb: bag.image("/a", 0, "eye", rgb), "message 0: its header has no time"),
         (lambda bag, rgb: [bag.image("/a", FIRST_NS, of, rgb) for of in "bc"], "the frames 'b' and 'c'"),
-        (lambda bag, rgb: [bag.image(f"/{of}", FIRST_NS, of, rgb) for of in "bc"], "pictures in /b, /c. Choose one"),
-        (lambda bag, rgb: bag.pose_stamped("/a", FIRST_NS, "map", np.eye(4)), "has no topic of pictures"),
+        (lambda bag, rgb: [bag.image(f"/{of}", FIRST_NS, of, rgb) for of in "bc"], "images in /b, /c. Choose one"),
+        (lambda bag, rgb: bag.pose_stamped("/a", FIRST_NS, "map", np.eye(4)), "has no topic of images"),
         (lambda bag, rgb: bag.image("/a", FIRST_NS, "eye", rgb[..., 0].astype(np.uint16), "16UC1"), "no topic of pict"),
     ],
 )
@@ -152,11 +152,11 @@ def test_of_several_topics_that_with_a_camera_is_taken(record, rgb):
 
     path = record(write)
     with open_bag(path) as bag:
-        assert picture_topic(bag) == "/right/image_raw"
-        assert picture_topic(bag, "/left/image_raw") == "/left/image_raw"
+        assert image_topic(bag) == "/right/image_raw"
+        assert image_topic(bag, "/left/image_raw") == "/left/image_raw"
         assert camera_of(bag, "/left/image_raw") is None
-        with pytest.raises(InputError, match=r"--topic /up: .*pictures: /left/image_raw, /right/image_raw"):
-            picture_topic(bag, "/up")
+        with pytest.raises(InputError, match=r"--topic /up: .*images: /left/image_raw, /right/image_raw"):
+            image_topic(bag, "/up")
 
 
 def test_the_camera_beside_a_topic_is_its_own():
@@ -167,7 +167,7 @@ def test_the_camera_beside_a_topic_is_its_own():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_cameras_by_hand(record, rgb, kind):
-    """Binned by 2 after a region is cut out: column u of the region is (u + 0.5) / 2 - 0.5 of the picture."""
+    """Binned by 2 after a region is cut out: column u of the region is (u + 0.5) / 2 - 0.5 of the image."""
     p = [[50, 0, 30, 0], [0, 50, 20, 0], [0, 0, 1, 0]]
 
     def write(bag):

@@ -30,14 +30,14 @@ _LONGEST_NAME = 80
 
 
 class Written(NamedTuple):
-    """Pictures in a scene's folder.
+    """Images in a scene's folder.
 
     Args:
         capture: of what was written; its cameras are pinholes.
         sizes: (width, height) of each image.
         rules: the rule that each of the others breaks, by file.
-        lenses: the cameras by the same names as the capture's, as they took the pictures.
-        decoding: how the pictures were decoded.
+        lenses: the cameras by the same names as the capture's, as they took the images.
+        decoding: how the images were decoded.
     """
 
     capture: Capture
@@ -47,7 +47,7 @@ class Written(NamedTuple):
     decoding: Decoding
 
 
-def write_pictures(capture: Capture, folder: Path) -> Written:
+def write_images(capture: Capture, folder: Path) -> Written:
     """Write every image that can be decoded and has its camera's shape to ``FOLDER/images/SEQUENCE/NAME``.
 
     Each has the pixels that its pose means, with 8 bits and without an EXIF orientation. Files are copied byte by byte
@@ -84,14 +84,14 @@ def write_pictures(capture: Capture, folder: Path) -> Written:
 
 
 def _said(told: Mapping[str, Camera], lenses: Mapping[str, Camera], odd: int, count: int) -> dict[str, str]:
-    """What was decided of pictures whose size is not their camera's, or not the others'."""
+    """What was decided of images whose size is not their camera's, or not the others'."""
     found, known = ({(each.width, each.height) for each in cameras.values()} for cameras in (lenses, told))
     said = {}
     if sizes := sorted(found - known):
         named = ", ".join(map(_times, sizes[:3]))
-        said["scaled cameras"] = f"to pictures of the same shape and another size than the capture says ({named})"
+        said["scaled cameras"] = f"to images of the same shape and another size than the capture says ({named})"
     if odd:
-        said["cropped"] = f"{odd} of {count} pictures to the middle, so that sizes near each other are one"
+        said["cropped"] = f"{odd} of {count} images to the middle, so that sizes near each other are one"
     return said
 
 
@@ -132,7 +132,7 @@ def _write(
     image, maps = first, None
     if name is not None:
         own = cameras.size(name)
-        # A camera's size may tell that a pose means a picture the other way round.
+        # A camera's size may tell that a pose means an image the other way round.
         ways = [first] if _size(first) == own else [first, *others]
         fits = [(way, cameras.fitted(name, _size(way))) for way in ways if not isinstance(way, str)]
         image, fit = max(fits, key=lambda fit: (_size(fit[0]) == own, fit[1] is not None))

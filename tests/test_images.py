@@ -1,4 +1,4 @@
-"""Pictures of every kind against Pillow."""
+"""Images of every kind against Pillow."""
 
 import io
 import struct
@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 
 from mambaloc.errors import InputError
 from mambaloc.exif import orientation_of, turned, turned_back, without_exif
-from mambaloc.images import decode_image, is_picture, pictures, read_image
+from mambaloc.images import decode_image, is_image, list_images, read_image
 
 TAGS = st.integers(1, 8)
 SIDES = st.integers(8, 24)
@@ -121,11 +121,11 @@ def test_a_photograph_of_sixteen_bits_keeps_its_upper_ones(tmp_path):
 )
 def test_stills_are_told_from_films_by_their_first_bytes(head, is_still, tmp_path):
     (tmp_path / "a").write_bytes(head + bytes(40))
-    assert is_picture(tmp_path / "a") == is_still
+    assert is_image(tmp_path / "a") == is_still
 
 
 def test_pictures_of_a_folder_come_in_natural_order(tmp_path):
     for name in ("10.PNG", "9.heic", "1.tif", "2.depth.png", "notes.txt"):
         (tmp_path / name).touch()
-    assert [path.name for path in pictures(tmp_path)] == ["1.tif", "9.heic", "10.PNG"]
-    assert pictures(tmp_path / "nothing") == []
+    assert [path.name for path in list_images(tmp_path)] == ["1.tif", "9.heic", "10.PNG"]
+    assert list_images(tmp_path / "nothing") == []

@@ -1,4 +1,4 @@
-"""Frames of a film as pictures: chosen for sharpness and movement, written as JPEG, and kept in the user's cache."""
+"""Frames of a video as images: chosen for sharpness and movement, written as JPEG, and kept in the user's cache."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.runtime.sources import SourceFrame, frames_of
 from mambaloc.user_cache import made_once
 
-FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
 """Suffixes of files that are taken for films."""
 
 _VERSION = 1  # of what is kept; another one is made again
@@ -24,27 +24,27 @@ _JPEG_QUALITY = 95
 _NOTE = "note.json"
 
 
-class FilmFrames(NamedTuple):
+class VideoFrames(NamedTuple):
     """Chosen frames of a film.
 
     Args:
-        images: the chosen frames by their number in the film, from 0.
-        read: how many frames the film had when it was read.
+        images: the chosen frames by their number in the video, from 0.
+        read: how many frames the video had when it was read.
     """
 
     images: dict[int, Path]
     read: int
 
 
-def chosen_as_stored(film: Path) -> FilmFrames:
-    """Choose frames of a film, and write them with the pixels that the film stores, whatever rotation it asks for.
+def chosen_as_stored(film: Path) -> VideoFrames:
+    """Choose frames of a video, and write them with the pixels that the video stores, whatever rotation it asks for.
 
     Raises:
-        InputError: where the film cannot be opened, or the cache not be written.
+        InputError: where the video cannot be opened, or the cache not be written.
     """
     folder = made_once(f"films/{digest_of([film], _VERSION)}", lambda partial: _write_chosen(film, partial))
     images = {int(path.stem): path for path in sorted(folder.glob("*.jpg"))}
-    return FilmFrames(images, json.loads((folder / _NOTE).read_text(encoding="utf-8"))["count"])
+    return VideoFrames(images, json.loads((folder / _NOTE).read_text(encoding="utf-8"))["count"])
 
 
 def _write_chosen(film: Path, folder: Path) -> None:
