@@ -106,7 +106,7 @@ class RecipeCLI(LightningCLI):
             parser.link_arguments(f"data.{shared}", f"model.init_args.{shared}")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Refuse a checkpoint that is none before anything reads it."""
+        """Refuse a file that is not a checkpoint before anything reads it."""
         super().parse_arguments(parser, args)
         if checkpoint := self.config[self.config["subcommand"]].get("ckpt_path"):
             Checkpoint.read(checkpoint)
@@ -213,7 +213,7 @@ class RecipeCLI(LightningCLI):
 def run_directory(config: Namespace) -> Path:
     """Name a run's folder: a resumed run's own, else ``trainer.default_root_dir``, else ``runs/RECIPE/TIME``.
 
-    The processes that Lightning starts for a distributed run are told by the first one; those that SLURM starts name it
+    The processes that Lightning starts for a distributed run get it from the first one; those that SLURM starts name it
     after their job and its step.
     """
     if os.environ.get("LOCAL_RANK", "0") != "0" and _RUN_DIR in os.environ:

@@ -135,6 +135,6 @@ def quieten() -> None:
 
 
 def _show_unless_of_the_disk(error: threading.ExceptHookArgs) -> None:
-    """Leave out what TensorBoard's thread could not write: the one that logs is told, too."""
+    """Leave out what TensorBoard's thread could not write: the thread that logs raises the same error."""
     if not issubclass(error.exc_type, OSError):
         threading.__excepthook__(error)

@@ -99,8 +99,8 @@ class LitDistillation(LitStudent):
         teacher: any system, as :func:`mambaloc.load` takes it: a checkpoint or the name of a released model. It
             normalises images and positions in its own way.
         hard_weight: of the loss against true poses; 0 switches it off.
-        soft_weight: likewise.
-        feature_weight: likewise.
+        soft_weight: weight of the soft loss.
+        feature_weight: weight of the feature loss.
         soft: ``kl`` as the paper's, or ``l2``.
         soft_args: further arguments of the soft loss: ``temperature``, ``s_position``, ``s_rotation``.
         cache_teacher: ask the teacher once a frame, of its centre crop, before the first epoch.
@@ -123,7 +123,7 @@ class LitDistillation(LitStudent):
         if min(hard_weight, soft_weight, feature_weight) < 0 or hard_weight + soft_weight == 0:
             raise InputError(
                 f"model: hard_weight {hard_weight}, soft_weight {soft_weight}, feature_weight {feature_weight}: "
-                "none is negative, and the first two teach the heads, so give one of them"
+                "none may be negative, and one of the first two must be positive to train the heads"
             )
         if teacher is None:
             raise InputError("model.teacher: distillation needs one; train any system, and name its checkpoint")
@@ -163,7 +163,9 @@ class LitDistillation(LitStudent):
         if self.hparams["cache_teacher"]:
             data = self.scene_for("cache_teacher")
             if data.hparams["views"]:
-                raise InputError("model.cache_teacher: asks of frames alone, not of data.views. Set one of them off.")
+                raise InputError(
+                    "model.cache_teacher: works with real frames alone. Turn off cache_teacher or data.views."
+                )
             batches = data.batches("train")
             shown = track(batches, "Asking the teacher", transient=True, disable=self.global_rank > 0)
             answers = [self.teacher(batch.image.to(self.device)) for batch in shown]

@@ -1,4 +1,4 @@
-"""What is a user's to mend: errors, and warnings where the work can go on."""
+"""What is a user's to repair: errors, and warnings where the work can go on."""
 
 from collections.abc import Collection
 from difflib import get_close_matches

@@ -35,7 +35,7 @@ _BACK = {6: 8, 8: 6}  # the others undo themselves
 
 
 def orientation_of(data: bytes) -> int:
-    """The orientation, 1 to 8, of a JPEG, PNG, WebP or TIFF file's bytes; 1 where none is said."""
+    """The orientation, 1 to 8, of a JPEG, PNG, WebP or TIFF file's bytes; 1 by default."""
     if is_tiff(data):
         return _in_tiff(data)
     if data.startswith(_JPEG):

@@ -38,7 +38,7 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
     Args:
         path: the file.
         missing: what the user may do where it cannot be read.
-        broken: what the user may do where it is no YAML.
+        broken: what the user may do where it is not YAML.
 
     Raises:
         InputError: in either case.
@@ -48,7 +48,7 @@ def read_yaml(path: Path, missing: str, broken: str) -> Any:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no YAML ({error}); {broken}") from None
+        raise InputError(f"{path}: is not YAML ({error}); {broken}") from None
     return parse_yaml(text, path, broken)
 
 
@@ -62,7 +62,7 @@ def parse_yaml(text: str, path: Path, broken: str) -> Any:
             raise InputError(f"{path}: its aliases stand for more than {_MOST_VALUES} values; write them out")
         return data
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # a ValueError: a number too long, or no date
-        raise InputError(f"{path}: is no YAML ({str(error).splitlines()[0]}); {broken}") from None
+        raise InputError(f"{path}: is not YAML ({str(error).splitlines()[0]}); {broken}") from None
 
 
 def _expanded(value: Any, known: dict[int, int]) -> int:
@@ -85,7 +85,7 @@ def read_json(path: Path, missing: str, broken: str) -> Any:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError, and so is a number too long
-        raise InputError(f"{path}: is no JSON ({str(error).splitlines()[0]}); {broken}") from None
+        raise InputError(f"{path}: is not JSON ({str(error).splitlines()[0]}); {broken}") from None
 
 
 def path_inside(folder: Path, name: str) -> Path | None:
@@ -101,10 +101,10 @@ def path_inside(folder: Path, name: str) -> Path | None:
 
 @contextmanager
 def writing(folder: Path, remedy: str = "choose another folder with --out") -> Iterator[None]:
-    """Tell an error of the block, which writes to a folder, in one line.
+    """Raise an OSError of the block, which writes to a folder, as an InputError of one line.
 
     Args:
-        folder: what is told.
+        folder: named in the message.
         remedy: what the user may do where it cannot be written.
 
     Raises:

@@ -39,7 +39,7 @@ END_BYTES = 4096
 """How far from a file's end its format's last marker may lie."""
 
 FULL_COUNTS: Counts = (0, 65535)
-"""Of an image that uses the whole of its 16 bits, as photographs do."""
+"""Of an image that uses the whole of its 16 bits, as photos do."""
 
 _STRAYS = 0.001  # of all pixels, at either end
 
@@ -173,7 +173,7 @@ def read_image(path: str | Path, counts: Counts | None = None) -> Image:
         counts: as :func:`decode_image` takes them.
 
     Raises:
-        InputError: where it is missing or no whole image, or has 16 bits and does not use them.
+        InputError: if it is missing, truncated or not an image, or has 16 bits and does not use them.
     """
     return _read(path, True, counts)
 

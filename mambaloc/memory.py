@@ -16,7 +16,7 @@ _KEPT_BYTES = 2**30
 
 
 def keep_freed_memory() -> bool:
-    """Let this process keep freed memory for what it allocates next; whether the C library can be told so.
+    """Let this process keep freed memory for what it allocates next; returns whether the C library allows it.
 
     glibc gives large blocks back to the system, which clears their pages before each use: a training step on a CPU
     frees and asks for the same gigabytes as the step before, and takes 1.11 times as long (MambaLoc). A ``MALLOC_``

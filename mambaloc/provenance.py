@@ -28,7 +28,7 @@ def commit() -> str | None:
 
 
 def seed() -> int:
-    """Return the run's seed, as ``lightning.seed_everything`` leaves it for every process; 0 where nobody set one."""
+    """Return the run's seed, as ``lightning.seed_everything`` leaves it for every process; 0 if it was not set."""
     return int(os.environ.get("PL_GLOBAL_SEED", "0"))
 
 

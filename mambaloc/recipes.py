@@ -30,7 +30,7 @@ def recipe_path(recipe: str) -> Path:
             ``recipes/quickstart.yaml``.
 
     Raises:
-        InputError: where there is none.
+        InputError: if there is no such recipe.
     """
     path = Path(recipe)
     if path.is_file():

@@ -34,7 +34,7 @@ class OneLineErrorParser(LightningArgumentParser):
 
 @contextmanager
 def tell_refusals(argv: list[str]) -> Iterator[None]:
-    """Tell what Lightning itself refuses in the block, such as a trainer's option, in one line.
+    """Raise what Lightning itself refuses in the block, such as a trainer's option, in one line.
 
     Args:
         argv: the command's words, of which the option is named.

@@ -22,7 +22,7 @@ Key = tuple[tuple[int, str, int, str], ...]
 
 
 def encoding_of(data: bytes) -> str:
-    """Python's name of a text's encoding, from its bytes or the first of them.
+    """Python's name of a text's encoding, from its bytes or the first ones.
 
     A byte order mark says it. Without one, text is UTF-8; UTF-16 where every other byte is zero, as in English text; or
     else Windows-1252, which editors on Windows still write.
@@ -46,12 +46,12 @@ def decode_text(data: bytes) -> str:
 
 
 def open_text(path: Path, newline: str | None = None, errors: str = "replace") -> TextIO:
-    """Open a text file of any usual encoding, which its first bytes tell, to read it line by line.
+    """Open a text file of any usual encoding, found by its first bytes, to read it line by line.
 
     Args:
         path: the file.
         newline: as of :func:`open`.
-        errors: likewise, of what cannot be decoded.
+        errors: how bytes are handled that cannot be decoded, as :func:`open` takes it.
 
     Raises:
         OSError: where it cannot be read.
@@ -64,8 +64,8 @@ def open_text(path: Path, newline: str | None = None, errors: str = "replace") -
 def natural(path: PurePath) -> Key:
     """Key to sort files as people do: ``2.jpg`` before ``10.jpg``, whatever zeros lead.
 
-    A name that is a time stamp such as ``1305031102.5.png`` sorts by its value: digits after its point are no number of
-    their own.
+    A name that is a time stamp such as ``1305031102.5.png`` sorts by its value: digits after its point do not count as
+    another number.
     """
     name = path.as_posix()
     if stamp := _STAMP.fullmatch(path.name):

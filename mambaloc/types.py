@@ -43,8 +43,9 @@ class PoseBatch:
         ``clip_length``: so many successive rows are frames of one sequence, in time order; B is a multiple of it.
         ``points_m`` (B, P, 3): scene points that each frame may see, world frame, NaN where it has fewer than P.
         ``intrinsics`` (B, 3, 3): pinhole matrices in pixels of ``image``, no skew; the data module always gives them.
-        ``holes`` (B, H, W) bool: pixels of synthetic views that show nothing of the scene; None where there are none.
-        ``scene`` (B,): which scene of several each image shows, in whose frame its pose is; None where there is one.
+        ``holes`` (B, H, W) bool: pixels of synthetic views that show nothing of the scene; None without synthetic
+        views. ``scene`` (B,): which scene of several each image shows, in whose frame its pose is; None where there is
+        one.
     """
 
     image: Tensor
@@ -97,7 +98,7 @@ class PosePrediction:
     Shape:
         ``position_m`` (B, 3) in metres. ``quaternion`` (B, 4) as the network regressed it: the loss and the
         metrics normalise it, ``mambaloc.geometry.canonical`` makes it a unit quaternion with ``w >= 0``.
-        ``log_quaternion`` (B, 3): what a system that regresses it said; ``quaternion`` is its exponential.
+        ``log_quaternion`` (B, 3): the output of a system that regresses it; ``quaternion`` is its exponential.
         ``auxiliary``: what auxiliary heads say while training.
         ``cells``: what a dense head's cells say, out of which it solves the pose.
         ``scene_logits`` (B, S): of a network that knows several scenes, how each fits the image. The pose is in the

@@ -1,4 +1,4 @@
-"""How far off a pose may be, and whether its image shows the place at all: told in the pass that localizes.
+"""Conformal error bounds and an out-of-distribution score, from the same forward pass as the pose.
 
 An image is compared with training images in what the backbone sees of it as a whole. The farther the nearest one, the
 larger the error: how much larger is measured on frames held out of training, by split conformal prediction (Lei et al.
@@ -129,7 +129,7 @@ class UncertaintyHead(nn.Module):
         return self.intercepts + self.slopes * distance.unsqueeze(-1)
 
     def forward(self, pooled_BD: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tell both radii and the unfamiliarity."""
+        """Return both radii and the unfamiliarity."""
         distance = self.distance(pooled_BD)
         radius_B2 = self.radii(distance)
         return radius_B2[:, 0], radius_B2[:, 1], distance / self.familiar
@@ -139,14 +139,14 @@ def fit_uncertainty(system: LitPoseRegressor, data: PoseDataModule | MultiSceneD
     """Measure how a system's errors grow with the distance to the training images, on its validation frames.
 
     Where the best epoch was chosen on them, they flatter it a little. Of several scenes, images are compared with
-    those of all: one that is unfamiliar shows none of them.
+    those of all: an unfamiliar image shows no known scene.
 
     Args:
         system: trained; left as it was.
         data: what it was trained with.
 
     Raises:
-        InputError: where too few frames were held out to tell, or they cannot be read.
+        InputError: where too few frames were held out to measure it, or they cannot be read.
     """
     head, held_out = head_and_held_out(system, data)
     head.calibrate(held_out, LEVEL)
@@ -216,7 +216,10 @@ def _check_held_out(data: PoseDataModule, trained_on: str | None) -> None:
         )
     count, needed = len(data.frames("val")), math.ceil(LEVEL / (1 - LEVEL) - 1e-9)
     if count < needed:
-        raise InputError(f"data.validation {validation}: {count} frames held out, {needed} tell how sure a pose is")
+        raise InputError(
+            f"data.validation {validation}: {count} frames are held out, but calibrating the uncertainty "
+            f"takes {needed}. Hold out more."
+        )
 
 
 @torch.inference_mode()
@@ -261,7 +264,7 @@ def conformal_quantile(values: NDArray[np.float64], level: float) -> float:
     """
     rank = math.ceil((len(values) + 1) * level - 1e-9)
     if rank > len(values):
-        raise ValueError(f"{len(values)} values tell no {level:.0%} quantile")
+        raise ValueError(f"{len(values)} values are too few for a {level:.0%} quantile")
     return float(np.sort(values)[rank - 1])
 
 

@@ -24,7 +24,7 @@ class Recorder:
     def __init__(self, kind: str, bag: Any) -> None:
         self.is_1, self.bag = kind == "bag", bag
         self.types = get_typestore(Stores.ROS1_NOETIC if self.is_1 else Stores.ROS2_HUMBLE)
-        if self.is_1:  # tf2_msgs is none of rosbags' own there
+        if self.is_1:  # tf2_msgs is not one of rosbags' own there
             self.types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
         self.connections: dict[str, Any] = {}
 

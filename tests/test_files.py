@@ -111,21 +111,23 @@ def test_a_name_in_a_file_stays_inside_of_the_folder(name, found):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(None, "cannot be read .*; add it"), (b"{", "is no JSON .*; mend it"), (b"\xff\xfe", "is no JSON .*; mend it"),
-     (b"9" * 5000, "is no JSON .*; mend it"), (b"[" * 100_000, "is no JSON .*; mend it")],
-)  # fmt: skip
+    [
+        (None, "cannot be read .*; add it"),
+        *((each, "is not JSON .*; repair it") for each in (b"{", b"\xff\xfe", b"9" * 5000, b"[" * 100_000)),
+    ],
+)
 def test_what_is_no_json(content, message, tmp_path):
     path = tmp_path / "a.json"
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
-        read_json(path, "add it", "mend it")
+        read_json(path, "add it", "repair it")
     assert "\n" not in str(caught.value)
 
 
 def test_json_that_is_too_large(tmp_path, monkeypatch):
     (tmp_path / "a.json").write_text("[1, 2, 3]")
-    assert read_json(tmp_path / "a.json", "add it", "mend it") == [1, 2, 3]
+    assert read_json(tmp_path / "a.json", "add it", "repair it") == [1, 2, 3]
     monkeypatch.setattr("mambaloc.files._MOST_JSON_BYTES", 5)
-    with pytest.raises(InputError, match="larger than 5 bytes; mend it"):
-        read_json(tmp_path / "a.json", "add it", "mend it")
+    with pytest.raises(InputError, match="larger than 5 bytes; repair it"):
+        read_json(tmp_path / "a.json", "add it", "repair it")

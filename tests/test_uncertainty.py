@@ -278,7 +278,7 @@ def test_a_contract_of_another_model_is_refused(exported, tmp_path):
     for entry in model.metadata_props:
         entry.value = contract_of(system, data.hparams).to_json()
     onnx.save(model, tmp_path / "model.onnx")
-    with pytest.raises(InputError, match=r"says \['position_m', .* as its contract does not; export it anew"):
+    with pytest.raises(InputError, match=r"says \['position_m', .* as its contract does not; export it again"):
         Localizer(tmp_path / "model.onnx")
 
 

@@ -78,16 +78,16 @@ class BagCamera:
 def image_topic(bag: Bag, asked: str | None = None) -> str:
     """The topic of a bag's images: the one there is, or the one of several that has a camera, unless one is named.
 
-    Topics of depth are none of them.
+    Topics of depth images do not count.
 
     Raises:
-        InputError: where there is none of that name, none at all, or several.
+        InputError: if no topic has that name, the bag has no topic of images, or it has several.
     """
     every = [topic for topic in bag.of_types((RAW, COMPRESSED)) if not _is_depth(bag, topic)]
     if asked is not None:
         if asked not in every:
             there = ", ".join(every) or "none"
-            raise InputError(f"--topic {asked}: {bag.path} has no images there. Its topics of images: {there}.")
+            raise InputError(f"--topic {asked}: {bag.path} this topic has no images. Topics of images: {there}.")
         return asked
     if not every:
         raise InputError(f"{bag.path}: has no topic of images (Image or CompressedImage). Record the camera's.")

@@ -55,7 +55,7 @@ def pose_source(bag: Bag, camera: str, asked: str | None = None, of: str | None 
         of: the frame whose poses the topic has, where its messages do not say that.
 
     Raises:
-        InputError: where there is none, or several, or no transform leads from there to the camera.
+        InputError: if the bag has no poses, several topics with poses, or no transform leads from there to the camera.
     """
     transforms = Transforms(bag)
     topics = [*bag.of_types(_POSES), *([TF] if _moves(transforms, camera) else [])]
@@ -66,7 +66,7 @@ def pose_source(bag: Bag, camera: str, asked: str | None = None, of: str | None 
     if not topics:
         raise InputError(
             f"{bag.path}: nothing says where the camera {camera!r} was: it has no Odometry, PoseStamped or "
-            f"TransformStamped, and {_still(transforms, camera)}. Record one of them with the images."
+            f"TransformStamped, and {_still(transforms, camera)}. Record such a topic with the images."
         )
     if asked is None and len(topics) > 1:
         raise InputError(f"{bag.path}: has poses in {', '.join(topics)}. Choose one with --pose-topic NAME.")

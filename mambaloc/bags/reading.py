@@ -95,7 +95,9 @@ class Bag:
         """
         for _, message in self.messages([topic]):
             return message
-        raise InputError(f"{self.path}: cannot be read ({topic} lacks its {self.counts[topic]} messages). {_FORGOTTEN}")
+        raise InputError(
+            f"{self.path}: cannot be read ({self.counts[topic]} messages of {topic} are missing). {_FORGOTTEN}"
+        )
 
     def _read(self, read: Callable[..., T], *arguments: Any) -> T:
         return _read(self.path, read, *arguments)

@@ -1,7 +1,7 @@
 """Where a frame is at a time, from transforms that were sent at others: ``/tf`` and ``/tf_static`` (Foote 2013).
 
 Positions are interpolated linearly, rotations along the shortest arc (Shoemake 1985), between the transforms before and
-after. Where these are too far apart, or there is none on one side, nothing is known.
+after. Where these are too far apart, or one is missing, the transform is unknown.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Link:
         return ns, np.array(self._values).reshape(-1, 7)[::-1][last]
 
     def at(self, ns: int) -> Matrix | Gap:
-        """``parent_from_child`` (4, 4) at a time, or why there is none."""
+        """``parent_from_child`` (4, 4) at a time, or why it is unknown."""
         times, values = self._samples
         if self.is_static:
             return _matrix(values[-1, :3], values[-1, 3:])
@@ -159,7 +159,7 @@ class Transforms:
             child = frames[-1]
             if len(self.parents[child]) > 1:
                 some = " and ".join(map(repr, sorted(self.parents[child])[:2]))
-                raise InputError(f"{self.bag.path}: frame {child!r} has the parents {some}. Record with one of them.")
+                raise InputError(f"{self.bag.path}: frame {child!r} has the parents {some}. Record with one parent.")
             frames.append(self.links[child].parent)
             if frames[-1] in frames[:-1]:
                 raise InputError(f"{self.bag.path}: frame {child!r} is above itself in /tf. Record with a tree.")

@@ -24,7 +24,7 @@ from mambaloc.errors import InputError
 from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.export import contract_of, export_onnx
 from mambaloc.export.precision import half_precision
-from mambaloc.export.quantisation import eight_bit, median_errors
+from mambaloc.export.quantization import eight_bit, median_errors
 from mambaloc.metrics import summarize
 from mambaloc.models import LitPoseRegressor
 from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT
@@ -42,7 +42,7 @@ class Deployment:
         size: bytes of its file.
         latency_s: of one image, each repetition.
         position_error_m: median over the test frames.
-        rotation_error_deg: likewise.
+        rotation_error_deg: median rotation error of each form.
         frames: that these are over.
         fits: whether it loses so little that a bundle may hold it.
     """
@@ -105,7 +105,7 @@ def measure_deployment(
 
 
 def speed_up(deployments: Sequence[Deployment], each: Deployment) -> tuple[float, float]:
-    """How many times faster a form is than the first of them: ratio of the medians, quartile range of the turns'."""
+    """How many times faster a form is than the first form: ratio of the medians, quartile range of the turns'."""
     first = deployments[0].latency_s
     low, _, high = quantiles([a / b for a, b in zip(first, each.latency_s, strict=True)], n=4)
     return median(first) / median(each.latency_s), high - low

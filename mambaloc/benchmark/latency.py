@@ -29,7 +29,7 @@ class Latency:
         what: ``forward`` or ``training step``.
         batch: images.
         without_s: seconds a repetition without GIS.
-        with_s: likewise with GIS.
+        with_s: the same with GIS.
     """
 
     system: str
@@ -60,7 +60,7 @@ def measure_latency(
     """Time forward passes and training steps, without and with GIS in turns, so that both meet the same machine.
 
     Raises:
-        InputError: for a device that is not there, or too few repetitions to tell a spread.
+        InputError: for a device that is not there, or too few repetitions to estimate a spread.
     """
     if repetitions < 4:
         raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")

@@ -37,7 +37,7 @@ class DecodedFrames(Dataset[tuple[Tensor, Tensor, Tensor]]):
     Args:
         data: the scene, set up.
         mean: RGB mean in 0..1 to normalise with.
-        std: RGB deviation, likewise.
+        std: RGB standard deviation in 0..1 to normalize with.
         part: ``train`` crops at random and jitters; ``val`` and ``test`` crop the centre.
 
     Shape:
@@ -204,12 +204,12 @@ PUBLISHED_DATA: dict[str, dict[str, int]] = {
 
 
 def published_form(system: LitPoseRegressor) -> Any:
-    """Return the class of a system's published network, or None where there is none here."""
+    """Return the class of a system's published network, or None without one here."""
     return next((network for ours, network in PUBLISHED.items() if isinstance(system, ours)), None)
 
 
 def check_loaded(data: PoseDataModule) -> None:
-    """Tell whether the published loop can load what a scene's training batches hold.
+    """Check whether the published loop can load what a scene's training batches hold.
 
     Raises:
         InputError: for clips and scene points, which it cannot.

@@ -14,7 +14,7 @@ from mambaloc import provenance
 from mambaloc.benchmark.deployment import Deployment, speed_up
 from mambaloc.benchmark.latency import Latency, forward_flops
 from mambaloc.benchmark.sizes import UNEXPLAINED, Size
-from mambaloc.export.quantisation import LARGEST_LOSS
+from mambaloc.export.quantization import LARGEST_LOSS
 from mambaloc.models.weights import mib
 
 NOT_SHIPPED = f"\n* loses more than {LARGEST_LOSS:.0%} of its median error, so no bundle holds it"

@@ -18,7 +18,7 @@ from mambaloc.models import LitPoseRegressor, create_model
 
 @dataclass(frozen=True)
 class Setting:
-    """A system on a scene, with whatever a recipe may say of them.
+    """A system on a scene, with any setting of a recipe.
 
     Args:
         system: its name.
@@ -61,7 +61,7 @@ class Setting:
         return _trainer(self).strategy.root_device
 
     def fit(self, system: LitPoseRegressor, data: PoseDataModule, callback: L.Callback, **options: Any) -> L.Trainer:
-        """Train with nothing beside the callback, and without validation unless told."""
+        """Train with this callback alone, and without validation unless asked for."""
         options = {"num_sanity_val_steps": 0, "limit_val_batches": 0, "max_steps": -1, **options}
         trainer = _trainer(self, callbacks=[callback], **options)
         trainer.fit(system, data)

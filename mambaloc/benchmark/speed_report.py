@@ -68,7 +68,7 @@ def measure_all(
 
 
 def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> None:
-    """Tell what is wrong before anything is measured.
+    """Check the arguments before anything is measured.
 
     Raises:
         InputError: for numbers that cannot be measured on this scene.

@@ -26,7 +26,7 @@ class WholeTraining:
         reached_s: to the first validation with that error; None where there was none.
         ended_s: to the end of the last step.
         position_error_m: median over the validation frames at the end.
-        rotation_error_deg: likewise.
+        rotation_error_deg: median rotation error on the test frames.
         selection: what the validation frames are.
     """
 
@@ -52,7 +52,7 @@ def measure_whole_training(setting: Setting, sought_m: float) -> WholeTraining:
 
 
 def check_whole_training(setting: Setting) -> None:
-    """Tell whether a setting can be trained to its end.
+    """Check whether a setting can be trained to its end.
 
     Raises:
         InputError: where nothing is validated on, or no end is set.

@@ -13,7 +13,8 @@ class EarlyStopping(callbacks.EarlyStopping):
 
     Args:
         monitor: a validation metric that should fall.
-        patience: epochs, or validations where they are no epochs, without a new lowest value; 0 never stops.
+        patience: epochs without a new lowest value, or validations where validation is not once an epoch; 0 never
+            stops.
         min_delta: how much lower counts.
     """
 
@@ -26,6 +27,6 @@ class EarlyStopping(callbacks.EarlyStopping):
             super().on_train_epoch_end(trainer, pl_module)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Likewise, where validation has a rhythm of its own."""
+        """Check after a validation, where it does not run once an epoch."""
         if self.patience:
             super().on_validation_end(trainer, pl_module)

@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 
 class MovedRun(L.Callback):
-    """Tell the callbacks of a resumed run where their checkpoints are now, before they read where these were.
+    """Update the checkpoint paths of a resumed run's callbacks, before they read the old ones.
 
     Lightning's ``ModelCheckpoint`` compares both places as text. Where they differ it forgets the best score so far,
     and replaces the best checkpoint by that of the next epoch.

@@ -24,7 +24,7 @@ class TimeBudget(L.Callback):
 
     Args:
         minutes: from ``began_s`` on, before any frame is read; None trains as the trainer says.
-        reserve_s: seconds of them for tests and export at the end.
+        reserve_s: seconds of the budget for tests and export at the end.
 
     Raises:
         InputError: for a budget that leaves no time to train.

@@ -52,7 +52,7 @@ class WallClock(L.Callback):
         self.began_at = self.began_at or time.time()
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Begin an epoch; what lay between epochs is nobody's."""
+        """Start the epoch timer. Time between epochs is not counted."""
         self._lap(pl_module, None)
 
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

@@ -1,4 +1,4 @@
-"""Checkpoints that are whole or not there, and told of where they cannot be written."""
+"""Atomic checkpoints, and a clear error where they cannot be written."""
 
 from __future__ import annotations
 

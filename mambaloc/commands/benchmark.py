@@ -19,7 +19,7 @@ def main() -> None:
     part = parts.add_parser("sizes", help="parameters of every system beside the paper's")
     part.set_defaults(call=lambda args: benchmark.print_sizes(benchmark.size_table()))
     part = parts.add_parser("latency", help="forward and training-step times with GIS, as ratios to without")
-    part.add_argument("systems", nargs="*", help="names; all of them unless given")
+    part.add_argument("systems", nargs="*", help="names; all by default")
     part.add_argument("--image-size", type=whole_number(32), default=224)
     part.add_argument("--repetitions", type=whole_number(2), default=20)
     part.add_argument("--device", default="cpu", help="cpu or cuda")

@@ -29,7 +29,7 @@ def main() -> None:
     args = parser.parse_args()
     formats = tuple(dict.fromkeys(word.strip() for word in args.to.split(",")))
     if unknown := sorted(map(repr, set(formats) - set(FORMATS))):
-        raise InputError(f"--to {args.to}: {', '.join(unknown)} is none of {', '.join(FORMATS)}")
+        raise InputError(f"--to {args.to}: {', '.join(unknown)} is not one of {', '.join(FORMATS)}")
     system, data = load_with_data(args.source, args.root)
     is_run = Path(args.source).is_file()
     out = args.out or (

@@ -47,4 +47,4 @@ def main() -> None:
     )
     print_summary(imported, args.out)
     if not imported.verdict.is_usable:
-        raise InputError(f"{args.out}: {imported.verdict}; see report.md there, and mend the capture")
+        raise InputError(f"{args.out}: {imported.verdict}; see report.md there, and repair the capture")

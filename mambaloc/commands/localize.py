@@ -74,7 +74,7 @@ def main() -> None:
     args = parser.parse_args()
     localizer = Localizer(_model(args.model), args.threads, args.sparse_map)
     if not is_bag(Path(args.source)) and (args.topic or args.world_frame or args.pose_frame):
-        raise InputError(f"{args.source}: is no ROS bag. Leave --topic, --world-frame and --pose-frame out.")
+        raise InputError(f"{args.source}: is not a ROS bag. Omit --topic, --world-frame and --pose-frame.")
     with _recording(localizer, args.rerun) as recording:
         if is_bag(Path(args.source)):
             said = _localize_bag(localizer, args, recording)

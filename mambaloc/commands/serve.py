@@ -52,7 +52,9 @@ def _token(path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"--token-file {path}: cannot be read ({error}). Give a file of one line.") from None
     if len(token) < 16 or not token.isascii() or not token.isprintable():
-        raise InputError(f"--token-file {path}: is no token of 16 characters or more. Make one: openssl rand -hex 32")
+        raise InputError(
+            f"--token-file {path}: is not a token of 16 characters or more. Make one: openssl rand -hex 32"
+        )
     return token
 
 

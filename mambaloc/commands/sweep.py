@@ -37,7 +37,7 @@ def _run(args: argparse.Namespace) -> None:
         print_plan(sweep, Store.ended(out))
         return
     ended = run_sweep(sweep, out, args.address, args.retry_failed)
-    print(f"{out}: {ended['done']} trials done, {ended['failed']} failed, {ended['found']} of them from before")
+    print(f"{out}: {ended['done']} trials done, {ended['failed']} failed, {ended['found']} from before")
 
 
 def _report(args: argparse.Namespace) -> None:

@@ -60,7 +60,7 @@ def cached_frames(
     cache_dir: Path | None = None,
     least: tuple[int, int] | None = None,
 ) -> FrameCache:
-    """Open the cache of some images, building it first where there is none.
+    """Open the cache of some images, building it first if it is missing.
 
     Args:
         paths: the images, in order.
@@ -121,7 +121,7 @@ def _fill(
     """Decode frames into a file, each cropped to a shape that all hold: the first one's unless given.
 
     Returns:
-        What is to be known of them; or None and a smaller shape to begin again with.
+        Where the frames are in the cache; or None and a smaller shape to begin again with.
     """
     images: np.memmap[Any, np.dtype[np.uint8]] | None = None
     rows: list[int] = []

@@ -1,4 +1,4 @@
-"""The cameras of a scene's frames: what the scene says of them, or a usual one in their stead."""
+"""The cameras of a scene's frames: those that the scene gives, or a usual one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
 
     An imported or rendered scene has them in ``scene.json``. 7-Scenes has one camera, of 525 px at a width of 640; its
     principal point is the image's centre. Other scenes have those of ``reconstruction.nvm`` or a COLMAP model, by
-    image and without distortion; an image that the model lacks gets its camera of median focal length.
+    image and without distortion; an image missing from the model gets its camera of median focal length.
 
     Args:
         dataset: its name.
@@ -64,7 +64,7 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
         return _of_model(_of_colmap(colmap, size), colmap, folder, size, frames)
     raise UnknownCameraError(
         f"{folder}: does not give its cameras: there is neither {NVM_FILE} nor a COLMAP model in "
-        f"{' or '.join(COLMAP_FOLDERS)}. Add one of them, or import the scene with mambaloc import."
+        f"{' or '.join(COLMAP_FOLDERS)}. Add such a file, or import the scene with mambaloc import."
     )
 
 
@@ -148,7 +148,7 @@ def _of_rendering(folder: Path, told: Any) -> Floats:
 
 
 def _of_model(matrices: dict[str, Floats], model: Path, folder: Path, size: Size, frames: Frames) -> Cameras:
-    """Each frame's camera by its name in a model, and the one of median focal length for frames that it lacks."""
+    """Each frame's camera by its name in a model, and the one of median focal length for frames missing from it."""
     rows = {name: row for name, row in frames.rows_by_name(folder).items() if name in matrices}
     if not rows:
         raise UnknownCameraError(

@@ -76,7 +76,7 @@ def load_colmap(path: Path) -> Any:
         except Exception as error:  # whatever COLMAP's C++ throws at a damaged file
             lines = str(error).strip().splitlines()[-1:] or [type(error).__name__]
             reason = lines[0].replace(str(folder), str(path))[:200]
-            message = f"{path}: is no COLMAP model that pycolmap can read ({reason}); export it again or remove it"
+            message = f"{path}: is not a COLMAP model that pycolmap can read ({reason}); export it again or remove it"
             raise InputError(message) from None
     return model
 

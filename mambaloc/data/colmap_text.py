@@ -86,7 +86,8 @@ def _images(path: Path) -> Iterator[tuple[int, list[str], str]]:
     while number:
         if line and not _is_image(line):
             raise InputError(
-                f"{path}, line {number}: is no image '{_IMAGE_LINE}', and no points 'X Y POINT3D_ID ...' of the image "
+                f"{path}, line {number}: is neither an image '{_IMAGE_LINE}' nor points 'X Y POINT3D_ID ...' of "
+                "the image "
                 "before it. Write two lines an image, the second empty where it has no points."
             )
         following = next(lines, (0, ""))
@@ -121,7 +122,7 @@ def _is_whole(word: str) -> bool:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines that are no comments, by their number from 1, without spaces around them."""
+    """Lines that are not comments, by their number from 1, without spaces around them."""
     with _opened(path) as file:
         number = 0
         while line := file.readline(_LONGEST_LINE):

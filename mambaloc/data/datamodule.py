@@ -46,8 +46,8 @@ class PoseDataModule(L.LightningDataModule):
         resident: keep decoded frames whole in the device's memory; unless given, on a GPU whose free memory they fill
             by half at most. On a CPU the memory map, which the operating system keeps, is as fast.
         brightness: range of that jitter factor, ``[1 - x, 1 + x]``.
-        contrast: likewise.
-        saturation: likewise.
+        contrast: the same of that factor.
+        saturation: the same of that factor.
         augmentation: each training image's view. ``crop``, the paper's: a random crop, which is asked for the frame's
             pose. ``rotation``: what a camera turned about its centre sees, whose pose is known exactly.
         rotation_deg: under ``rotation``, turns are uniform within so much, about each of the camera's axes.
@@ -148,7 +148,7 @@ class PoseDataModule(L.LightningDataModule):
         return [self]
 
     def setup(self, stage: str) -> None:
-        """Read and decode what a stage needs; every process may, since the cache is built by one of them."""
+        """Read and decode what a stage needs; every process may, since only one builds the cache."""
         if stage in ("fit", "validate"):
             self.scene.load_training()
         if stage in ("test", "predict"):
@@ -169,7 +169,7 @@ class PoseDataModule(L.LightningDataModule):
         """Read the whole training split's poses, without decoding an image.
 
         Raises:
-            InputError: where there is none.
+            InputError: if the scene has no training frame.
         """
         return self.scene.read("train")[0]
 
@@ -177,7 +177,7 @@ class PoseDataModule(L.LightningDataModule):
         """Read the poses of those training frames that are neither held out nor thinned away, without an image.
 
         Raises:
-            InputError: where there is none.
+            InputError: if the scene has no training frame.
         """
         return self.scene.choose()[0][0]
 
@@ -229,7 +229,7 @@ class PoseDataModule(L.LightningDataModule):
 
         Args:
             part: of those that are set up.
-            rows: of :meth:`frames`; all of them unless given.
+            rows: of :meth:`frames`; all by default.
             size: frames a batch; ``eval_batch_size`` unless given.
         """
         loaded, size = self.scene.parts[part].data, size or self.hparams["eval_batch_size"]

@@ -27,7 +27,7 @@ from mambaloc.types import PoseBatch
 
 
 class CachedFrames(Dataset[PoseBatch]):
-    """Frames of one part of a scene, already decoded; an item is a frame, or a clip of them.
+    """Frames of one part of a scene, already decoded; an item is a frame, or a clip of frames.
 
     Args:
         frames: N posed frames.
@@ -153,7 +153,7 @@ def load_split(
 
 
 def _of_middle(cameras: Cameras, sizes: NDArray[np.int64], crop: tuple[int, int]) -> Cameras:
-    """Cameras of the middle (height, width) of images that were resized to sizes (N, 2), likewise."""
+    """Cameras of the middle (height, width) of images that were resized to sizes (N, 2)."""
     size_px, resized = torch.from_numpy(cameras.size_px), torch.from_numpy(sizes).flip(1)
     scale_x, scale_y = (resized / size_px).unbind(dim=1)
     intrinsics = resized_intrinsics(torch.from_numpy(cameras.intrinsics), scale_x, scale_y)

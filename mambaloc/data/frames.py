@@ -57,11 +57,11 @@ class BadFrames:
             InputError: under the policy ``error``.
         """
         if self.policy == "error":
-            raise InputError(f"{path}: {rule}; mend or remove it, or leave it out with on_bad_frame: skip")
+            raise InputError(f"{path}: {rule}; repair or remove it, or leave it out with on_bad_frame: skip")
         self.rejected.append(Rejection(path, rule))
 
     def repair(self, path: Path, rule: str) -> None:
-        """Record a frame that was mended and kept."""
+        """Record a frame that was repaired and kept."""
         self.repaired.append(Rejection(path, rule))
 
     def counts(self) -> dict[str, int]:

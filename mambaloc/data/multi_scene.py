@@ -132,7 +132,7 @@ class MultiSceneDataModule(L.LightningDataModule):
 
 
 def joined(parts: list[PoseBatch]) -> PoseBatch:
-    """Put batches of one image size together; points and holes that some have are none in the others."""
+    """Put batches of one image size together; where only some have points or holes, the others get empty ones."""
     first = parts[0]
     if any(part.clip_length != first.clip_length for part in parts):
         raise ValueError("batches of clips have one length")

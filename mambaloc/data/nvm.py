@@ -142,7 +142,7 @@ def _read_point(lines: _Lines, line: str, cameras: int) -> tuple[Point, list[int
     if length != len(images) or len(words) != _POINT_NUMBERS + _TRACK_NUMBERS * length:
         raise lines.error(f"is a point with a track of {length}, but has {len(words) - _POINT_NUMBERS} numbers of it")
     if images and not (min(images) >= 0 and max(images) < cameras):
-        raise lines.error(f"is a point seen by an image that is none of the {cameras} cameras")
+        raise lines.error(f"is a point seen by an image that is not one of the {cameras} cameras")
     if not np.isfinite((x, y, z)).all():
         raise lines.error("is a point whose position is not finite")
     return (x, y, z), images

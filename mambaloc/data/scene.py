@@ -34,7 +34,7 @@ from mambaloc.synthesis import Splatter
 from mambaloc.types import height_and_width
 
 Read = tuple[Frames, BadFrames]
-"""Posed frames, not yet decoded, and what was left out of them."""
+"""Posed frames, not yet decoded, and the frames left out."""
 
 
 @dataclass
@@ -107,7 +107,7 @@ class Scene:
         """Read the poses of a whole split, without decoding an image.
 
         Raises:
-            InputError: where there is none, or for a bad frame under ``on_bad_frame: error``.
+            InputError: if there is no such scene, or for a bad frame under ``on_bad_frame: error``.
         """
         bad = BadFrames(self.on_bad_frame)
         folder = self.folder  # first of all: an unknown dataset is told here
@@ -235,7 +235,7 @@ class Scene:
         }
 
     def _marked(self) -> Read | None:
-        """Frames that the scene marks for validation, and what was left out of them."""
+        """Frames that the scene marks for validation, and the frames left out."""
         if DATASETS[self.dataset].marks_validation:
             frames, bad = self.read("val")
             if len(frames):

@@ -107,7 +107,7 @@ def subsample(frames: Frames, keep_every: int = 1, keep_count: int | None = None
     """
     if keep_count is not None:
         if keep_every != 1:
-            raise InputError(f"data.keep_count {keep_count} and keep_every {keep_every}: give one of them")
+            raise InputError(f"data.keep_count {keep_count} and keep_every {keep_every}: give only one")
         if not 1 <= keep_count <= len(frames):
             raise InputError(f"data.keep_count {keep_count}: there are {len(frames)} training frames")
         return (np.arange(keep_count) * len(frames)) // keep_count

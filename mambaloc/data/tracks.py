@@ -39,7 +39,7 @@ class Tracks:
         return len(self.points_m)
 
     def of_frames(self, rows: NDArray[np.int64]) -> Tracks:
-        """What some frames see, numbered in their new order; points that none of them sees are left out."""
+        """What some frames see, numbered in their new order; points that no frame sees are left out."""
         if not len(rows):
             return Tracks(self.points_m[:0], self.point[:0], self.frame[:0], self.rays[:0])
         order = np.argsort(rows, kind="stable")

@@ -2,8 +2,8 @@
 
 from mambaloc.demo.server import serve, serve_page
 from mambaloc.demo.site import build_site
-from mambaloc.renamed import renamed
 from mambaloc.demo.video import embedded_video
+from mambaloc.renamed import renamed
 
 __getattr__ = renamed(__name__, {"embedded_film": "embedded_video"})
 __all__ = ["build_site", "embedded_video", "serve", "serve_page"]

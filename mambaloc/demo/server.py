@@ -40,7 +40,7 @@ def serve_page(bundle: Path, film: Path | None, port: int, lan: bool) -> None:
 
     Args:
         bundle: as :func:`~mambaloc.demo.site.build_site` takes it.
-        film: likewise.
+        film: a video for the page to play, or the folder of a video with poses.
         port: as :func:`serve` takes it.
         lan: serve the local network by HTTPS, and print the address as a code to scan, too.
 
@@ -65,7 +65,7 @@ def serve(site: Path, port: int, host: str = LOOPBACK, tls: ssl.SSLContext | Non
 
     Args:
         site: the folder.
-        port: 0 takes a free one, which ``server_port`` tells.
+        port: 0 takes a free one, which ``server_port`` has.
         host: address to listen at.
         tls: with it, HTTPS.
 

@@ -33,7 +33,7 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
         film: a video for the page to play, or what :func:`embedded_video` gives.
 
     Raises:
-        InputError: for a bundle or video that is none, a folder that cannot be written, or without Node.js's npm.
+        InputError: for an invalid bundle or video, a folder that cannot be written, or without Node.js's npm.
     """
     verify_bundle(bundle)
     if out.exists():

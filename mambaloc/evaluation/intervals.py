@@ -1,4 +1,4 @@
-"""How sure a median is: bootstrap over blocks of a video, whose neighbouring frames err alike."""
+"""Confidence intervals of a median: bootstrap over blocks of a video, since errors of neighbours are correlated."""
 
 from __future__ import annotations
 

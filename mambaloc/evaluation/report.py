@@ -86,7 +86,7 @@ def _pose(position_m: float, rotation_deg: float) -> str:
 def _map_line(in_map: dict[str, Any]) -> str:
     metrics = in_map["metrics"]
     return (
-        f"map: {metrics['accepted']:.1%} of its poses accepted, {metrics['accepted_and_wrong']:.1%} of them wrong "
+        f"map: {metrics['accepted']:.1%} of its poses accepted, of those {metrics['accepted_and_wrong']:.1%} wrong "
         f"(over 0.2 m or 5°); {metrics['query_cpu_ms']:.0f} ms of CPU time an image, {in_map['mib']:.2f} MiB"
     )
 

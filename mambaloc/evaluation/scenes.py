@@ -19,7 +19,7 @@ def evaluate_scenes(
 ) -> dict[str, dict[str, Any]]:
     """Localize every test frame of every scene, each scene's result in a folder of its own below ``out``.
 
-    The network is not told which scene a frame is of. Where it takes a frame for another scene's, the errors are
+    The network does not know which scene a frame is of. Where it takes a frame for another scene's, the errors are
     infinite, and means leave it out.
 
     Args:

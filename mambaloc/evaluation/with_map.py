@@ -37,7 +37,7 @@ class Answers:
     Args:
         table: the answers and their errors, a row a frame.
         sources: what gave each, ``map`` or ``network``.
-        is_accepted: which of them are poses that the map accepts, (N,).
+        is_accepted: whether the map accepts each pose, (N,).
         is_covered: which true poses are inside the 90 % ellipsoid of the answer's covariance, (N,).
         cpu_s: CPU time that the map took on all cores, without decoding the image, (N,).
         poses: the answers of a network and a map together, with their radii; none of a map alone.

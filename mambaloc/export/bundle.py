@@ -23,7 +23,7 @@ from mambaloc.export.onnx import contract_of_training, export_onnx
 from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
 from mambaloc.export.preprocessing import with_preprocessing
-from mambaloc.export.quantisation import EightBit, eight_bit
+from mambaloc.export.quantization import EightBit, eight_bit
 from mambaloc.files import sha256, whole_folder
 from mambaloc.geometry import canonical
 from mambaloc.images import Image, read_image
@@ -47,7 +47,7 @@ class WrittenBundle:
     Args:
         deviations: of each model in the bundle from PyTorch.
         int8: how quantisation went, where it was asked for; left out unless it ``fits``.
-        unsure: why the models cannot tell how sure a pose is, where they cannot.
+        unsure: why the models estimate no uncertainty, if they do not.
     """
 
     deviations: list[Deviation]
@@ -66,7 +66,7 @@ def write_bundle(
 ) -> WrittenBundle:
     """Write a bundle's folder; it appears once every model in it has found the poses that the system finds.
 
-    Int8 is left out where it loses too much; see :func:`~mambaloc.export.quantisation.eight_bit`.
+    Int8 is left out where it loses too much; see :func:`~mambaloc.export.quantization.eight_bit`.
 
     Args:
         system: trained.
@@ -77,7 +77,7 @@ def write_bundle(
         raw_input: resize, crop and scale inside the models, which then take RGB of any size, as every page on
             integration has it; otherwise they take what :class:`~mambaloc.runtime.contract.Preprocessing` makes of
             an image.
-        sparse_map: file of a map of the scene, which is copied into the bundle; of several scenes there is none.
+        sparse_map: file of a map of the scene, which is copied into the bundle; None for several scenes.
 
     Raises:
         InputError: where the folder is there or cannot be written, the test frames are not there, a model deviates, the
@@ -95,7 +95,7 @@ def write_bundle(
         try:
             uncertainty, unsure = fit_uncertainty(system, data), None
         except InputError as error:
-            uncertainty, unsure = None, f"the models tell no uncertainty: {error}"
+            uncertainty, unsure = None, f"the models estimate no uncertainty: {error}"
         in_map = None if sparse_map is None else _copy_map(sparse_map, scenes[0], partial)
         contract, int8 = _write_models(system, data, partial, formats, raw_input, uncertainty)
         written = [name for name in formats if (partial / MODEL_FILES[name]).is_file()]

@@ -48,8 +48,8 @@ class Parity:
     Args:
         position_m: of positions.
         rotation_deg: of rotations.
-        reach_m: largest distance from the scene's origin that PyTorch said; float32 rounds in proportion to it.
-        uncertainty: of radii and unfamiliarity, over PyTorch's; 0 for a model that tells none.
+        reach_m: largest distance from the scene's origin in PyTorch's output; float32 rounds in proportion to it.
+        uncertainty: of radii and unfamiliarity, over PyTorch's; 0 for a model without them.
         scene: of scenes' probabilities; 0 for a model that knows one.
     """
 
@@ -65,7 +65,7 @@ class DeployedNetwork(nn.Module):
 
     Args:
         network: of the system.
-        uncertainty: tells how sure each pose is.
+        uncertainty: estimates each pose's uncertainty; None for a model without it.
 
     Shape:
         (B, 3, H, W) in 0..1, and for a network that takes them intrinsics (B, 3, 3) in its pixels -> (B, 3) in metres
@@ -102,8 +102,8 @@ def export_onnx(
     Args:
         system: trained; left as it was.
         path: the file; it appears only once it is complete and has passed.
-        contract: what the file tells of itself; :func:`contract_of` makes it.
-        uncertainty: for a model that tells how sure each pose is.
+        contract: metadata to write into the file; :func:`contract_of` makes it.
+        uncertainty: for a model that estimates each pose's uncertainty.
         tolerance_m: largest position difference allowed, in metres per metre of the scene's size (at least one) or of
             the distance that the network says: noise may lead it far out of the scene.
         tolerance_deg: largest rotation difference allowed.
@@ -140,7 +140,7 @@ def contract_of(
     Args:
         system: trained.
         data: hyperparameters of the data module that it was trained with.
-        uncertainty: that the model will tell.
+        uncertainty: that the model will estimate.
         world: of the scene; without a shift unless given.
         undistortion: of the scene's images; with no lens known unless given.
         scenes: that the network knows, where there are several.
@@ -176,7 +176,7 @@ def contract_of_training(
     Args:
         system: trained.
         data: what it was trained with.
-        uncertainty: that the model will tell.
+        uncertainty: that the model will estimate.
     """
     first, *others = data.each_scene()
     if not isinstance(data, MultiSceneDataModule):

@@ -136,7 +136,8 @@ def _uncertainty(contract: Contract) -> str:
     told = contract.uncertainty
     if told is None:
         return (
-            "The models do not tell: too few frames are known to have been held out of their training to measure it on."
+            "The models do not estimate it: too few frames are known to have been held out of their training to "
+            "measure it on."
         )
     return (
         f"Beside the pose the models say `position_radius_m` and `rotation_radius_deg`: {told['level']:.0%} of the "

@@ -103,14 +103,14 @@ _SHORT_SIDE_OF_CAMERA = """
             short_side = Squeeze(at_most)"""
 
 _CROP_OF_CAMERA = """
-            lacking_signed = Sub(crop, new_size)
-            lacking = Max(lacking_signed, zero)
-            lacking_and_one = Add(lacking, one)
-            before = Div(lacking_and_one, two)
-            after = Sub(lacking, before)
+            missing_signed = Sub(crop, new_size)
+            missing = Max(missing_signed, zero)
+            missing_and_one = Add(missing, one)
+            before = Div(missing_and_one, two)
+            after = Sub(missing, before)
             borders = Concat<axis = 0>(before, after)
             bordered = Pad(batch, borders, none, axes)
-            bordered_size = Add(new_size, lacking)
+            bordered_size = Add(new_size, missing)
             spare = Sub(bordered_size, crop)
             start = Div(spare, two)
             end = Add(start, crop)

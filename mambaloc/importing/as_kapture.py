@@ -45,8 +45,8 @@ def write_kapture(scene: Path, out: Path) -> tuple[dict[str, int], int]:
         How many frames each kapture has, by its folder's name, and how many the scene marks as unused.
 
     Raises:
-        InputError: for a scene that is none or marks no frame, an image whose path has a comma, or a folder that is
-            there or cannot be written.
+        InputError: for a folder that is not a scene or marks no frame, an image whose path has a comma, or a folder
+            that is there or cannot be written.
     """
     if out.exists():
         raise InputError(f"{out}: is there already, and nothing is overwritten; remove it, or choose another --out")
@@ -57,9 +57,7 @@ def write_kapture(scene: Path, out: Path) -> tuple[dict[str, int], int]:
         raise InputError(f"{scene}: marks no frame for training, validation or testing; mark some in frames.csv")
     bad = next((row.image for row in rows if "," in row.image.relative_to(scene).as_posix()), None)
     if bad is not None:
-        raise InputError(
-            f"{bad}: has a comma in its path, which kapture cannot tell from the end of a value; rename it"
-        )
+        raise InputError(f"{bad}: has a comma in its path, which kapture reads as the end of a value. Rename it.")
     stamps, sensors = _stamps(rows), Sensors()
     counts = {}
     with whole_folder(out, "choose another folder with --out") as partial:

@@ -103,7 +103,7 @@ def write_scene(imported: Imported, folder: Path, source: Path, command: str) ->
     """Write ``scene.json``.
 
     Args:
-        imported: what to tell.
+        imported: the scene and what was found of it.
         folder: where to.
         source: that it was made of.
         command: that made it.

@@ -64,10 +64,10 @@ class Capture:
         unit: of positions: ``unknown`` where the format's scale is arbitrary.
         metres_per_unit: what the source says of its unit; None where it says nothing, or always has the same.
         choices: what was decided of axes, direction, scale and origin, and why, by name; goes into ``scene.json``.
-        cameras: by name; empty where the format tells of none.
-        camera_of: N names, or None where the format tells of none.
-        time_s: (N,) where the format tells of it.
-        split: N of ``train``, ``val``, ``test`` where the format tells of them.
+        cameras: by name; empty if the format has none.
+        camera_of: N names, or None if the format has no cameras.
+        time_s: (N,); None if the format has no times.
+        split: N of ``train``, ``val``, ``test``; None if the format has no splits.
         split_concern: what the capture has that gives no split, or only part of one, in a line; empty where nothing.
         poses_without_image: what the format names and is not there.
         images_without_pose: images beside those used.

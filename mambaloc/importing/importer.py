@@ -44,7 +44,7 @@ def import_scene(
         source: the capture.
         out: the scene's folder, which must not be there yet.
         kind: the capture's format; found out unless given.
-        metres_per_unit: what the source's unit is; as the source tells unless given.
+        metres_per_unit: what the source's unit is; as the source states by default.
         split: of :data:`~mambaloc.importing.splits.selection.ASKED`.
         command: that this was asked for with.
         with_adjusted: also write poses that are adjusted to the images, in a file of their own.
@@ -52,7 +52,7 @@ def import_scene(
         topics: what to read of a ROS bag.
 
     Raises:
-        InputError: for a source that is none, a folder that is there or cannot be written, or a split that cannot be
+        InputError: for an invalid source, a folder that is there or cannot be written, or a split that cannot be
             made.
     """
     if out.exists():

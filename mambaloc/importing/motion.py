@@ -33,7 +33,7 @@ class Motion:
         extent: length of the diagonal of the box that holds nine tenths of the camera centres along each axis.
         step: how far neighbours are apart: the median step, or, where frames come in no order, the median distance to
             the nearest frame.
-        step_deg: likewise.
+        step_deg: the same of view directions.
         in_order: whether the frames follow a path.
         jumps: rows of frames that the camera cannot have reached.
     """

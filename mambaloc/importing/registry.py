@@ -39,7 +39,7 @@ class Format:
 
     Args:
         looks_like: what a person sees, for messages.
-        matches: whether a source is in it, by the names of its files, and by their lines where names tell nothing.
+        matches: whether a source is in it, by the names of its files, and by their lines where names are ambiguous.
         read: read it; raises :class:`InputError` that names the file, the rule and the remedy.
         names_images: whether the format names its images by their paths, so that ``read`` takes a folder to find them.
     """
@@ -51,7 +51,7 @@ class Format:
 
 
 def _by_name_alone(source: Path) -> bool:
-    """Never: what cannot be told from a source is asked for with ``--format``."""
+    """Never: a format that cannot be detected is asked for with ``--format``."""
     return False
 
 
@@ -128,7 +128,7 @@ FORMATS: dict[str, Format] = {
     ),
     "structure_from_motion": Format("a video or images alone", structure.is_video_or_images, structure.read_structure),
 }
-"""By name, the most telling first: the first that matches a source is taken."""
+"""By name, the most specific first: the first that matches a source is taken."""
 
 
 def read_capture(
@@ -148,14 +148,14 @@ def read_capture(
     if not source.exists():
         raise InputError(f"{source}: there is no such file or folder; give a capture's")
     if kind is not None and kind not in FORMATS:
-        raise InputError(f"--format {kind}: there is none; choose one of {', '.join(FORMATS)}")
+        raise InputError(f"unknown --format {kind}; choose one of {', '.join(FORMATS)}")
     kind = kind or next((name for name, known in FORMATS.items() if known.matches(source)), None)
     if kind is None:
         known = "; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
         raise InputError(f"{source}: looks like no format that is known ({known}); name it with --format")
     if topics is not None:
         if kind != "ros_bag":
-            raise InputError(f"{source}: is no ROS bag but {kind}, without topics. Leave --topic and --pose-* out.")
+            raise InputError(f"{source}: is not a ROS bag but {kind}, which has no topics. Omit --topic and --pose-*.")
         return ros_bag.read_ros_bag(source, topics)
     if images is None:
         return FORMATS[kind].read(source)

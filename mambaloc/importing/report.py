@@ -176,7 +176,7 @@ def _of_agreement(found: Agreement, unit: str) -> list[str]:
     parts.append(
         "The focal length is tried with the poses as they are. A focal length that is too long and turns that are too "
         "small look alike in matches"
-        + ("; depth tells them apart better." if found.depth else ", unless there is depth.")
+        + ("; depth distinguishes them better." if found.depth else ", unless there is depth.")
     )
     if (adjusted := found.adjusted) is not None:
         held = "the given poses and depth" if adjusted.with_depth else "the given poses"

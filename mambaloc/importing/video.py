@@ -17,7 +17,7 @@ from mambaloc.runtime.sources import SourceFrame, frames_of
 from mambaloc.user_cache import made_once
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
-"""Suffixes of files that are taken for films."""
+"""Suffixes of files that are taken for videos."""
 
 _VERSION = 1  # of what is kept; another one is made again
 _JPEG_QUALITY = 95
@@ -25,7 +25,7 @@ _NOTE = "note.json"
 
 
 class VideoFrames(NamedTuple):
-    """Chosen frames of a film.
+    """Chosen frames of a video.
 
     Args:
         images: the chosen frames by their number in the video, from 0.

@@ -24,7 +24,7 @@ def in_its_world(capture: Capture, metres_per_unit: float | None) -> tuple[Captu
 
     Args:
         capture: as it was read.
-        metres_per_unit: what the format's unit is; as the format tells unless given.
+        metres_per_unit: what the format's unit is; as the format states by default.
 
     Returns:
         The capture, with its offset, and the rule that each frame that was left out breaks, by file.
@@ -39,7 +39,7 @@ def in_its_world(capture: Capture, metres_per_unit: float | None) -> tuple[Captu
 
 
 def _without(capture: Capture, rules: Mapping[int, str]) -> tuple[Capture, dict[str, str]]:
-    """A capture without some rows, and the rule that each of them breaks, by file."""
+    """A capture without some rows, and the rule that each breaks, by file."""
     if not rules:
         return capture, {}
     kept = selected(capture, [row for row in range(len(capture.images)) if row not in rules])

@@ -30,7 +30,7 @@ def build_loss(name: str, args: dict[str, Any] | None = None) -> nn.Module:
         InputError: for an unknown name or an argument that the loss does not take.
     """
     if name not in LOSSES:
-        raise InputError(f"loss {name!r}: there is none; choose one of {', '.join(LOSSES)}")
+        raise InputError(f"unknown loss {name!r}; choose one of {', '.join(LOSSES)}")
     try:
         return LOSSES[name](**(args or {}))
     except (TypeError, ValueError) as error:

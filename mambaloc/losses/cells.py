@@ -93,7 +93,7 @@ def points_of_cells(target: PoseBatch, grid: tuple[int, int]) -> tuple[Tensor, T
         grid: rows and columns, which divide the image evenly.
 
     Returns:
-        (B, N, 3) in metres, 0 where there is none, and whether there is one, (B, N).
+        (B, N, 3) in metres, 0 where it is unknown, and whether it is known, (B, N).
     """
     assert target.points_m is not None
     assert target.intrinsics is not None

@@ -117,7 +117,8 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
         threads: to decode, search and match with; one per core unless given. The result does not depend on it.
 
     Raises:
-        InputError: where frames are too few, lack texture or parallax, or contradict their poses; or an image is bad.
+        InputError: where there are too few frames, too little texture or parallax, or poses that the images contradict;
+            or an image is bad.
     """
     if len(frames) < 2:
         raise InputError(

@@ -96,7 +96,7 @@ def localize_frames(
 
     Args:
         localizer: in the map.
-        images: paths or RGB arrays (H, W, 3), N of them.
+        images: N paths or RGB arrays (H, W, 3).
         intrinsics: (N, 3, 3).
         priors: a pose to search around, of each image that has one.
 

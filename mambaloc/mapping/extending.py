@@ -35,7 +35,7 @@ class Extension:
     """What new key frames add.
 
     Shape:
-        ``world_from_cam`` (N, 4, 4); ``views`` (P, N), which of them see which point of the map; ``points_m`` (T, 3),
+        ``world_from_cam`` (N, 4, 4); ``views`` (P, N), which frames see which point of the map; ``points_m`` (T, 3),
         ``descriptors`` (T, 128) and ``new_views`` (T, N) of new points, the most seen first.
     """
 
@@ -59,7 +59,7 @@ def extend(
     Args:
         localizer: in the map.
         features: of each new key frame.
-        matched: rows of keypoints that match between two of them, (M, 2).
+        matched: rows of keypoints that match between two frames, (M, 2).
         world_from_cam: where the map found it, (N, 4, 4).
         given: the same from elsewhere, a prior; None where that is not known.
         most_points: new points to keep.

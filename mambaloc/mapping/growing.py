@@ -35,7 +35,7 @@ class NewFrame:
     """A frame to add to a map.
 
     Args:
-        name: of its file, or its number in a film.
+        name: of its file, or its number in a video.
         features: its keypoints, as :meth:`~mambaloc.runtime.maps.MapLocalizer.features` finds them.
         given: its pose in the map's world, where it is known.
     """

@@ -1,4 +1,4 @@
-"""Frames to add to a map: of a scene with poses, of a folder of images, or of a film."""
+"""Frames to add to a map: of a scene with poses, of a folder of images, or of a video."""
 
 from __future__ import annotations
 

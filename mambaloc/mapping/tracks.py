@@ -71,7 +71,7 @@ def connected(count: int, edges: Indices) -> Indices:
 
     Args:
         count: of nodes.
-        edges: pairs of them, (E, 2).
+        edges: pairs of keypoints, (E, 2).
     """
     root = np.arange(count)
     while (ends := root[edges]).size and (ends[:, 0] != ends[:, 1]).any():

@@ -40,7 +40,7 @@ class Observations:
         return len(self.frame)
 
     def select(self, rows: NDArray[np.generic]) -> Observations:
-        """Some of them: indices or a mask."""
+        """Select some, by indices or a mask."""
         return Observations(self.frame[rows], self.track[rows], self.rays[rows], self.near[rows])
 
     def as_near_as(self, off: Floats) -> Observations:

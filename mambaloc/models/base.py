@@ -55,7 +55,7 @@ class LitPoseRegressor(L.LightningModule):
         backbone_weights: ``timm`` downloads timm's own; otherwise a ``.safetensors`` file; None starts from scratch.
         backbone_args: passed on to timm, for instance ``{"pad_type": "same"}``.
         pixel_mean: RGB mean that the backbone expects, in 0..1; timm's for it unless given.
-        pixel_std: RGB deviation, likewise.
+        pixel_std: RGB standard deviation in 0..1 to normalize with.
         gis: the Global Information Selector of each branch: ``gis``, its ablation ``classical``, or ``none``.
         discretisation: of GIS's state space: ``euler`` or ``zoh``.
         scenes: names of the scenes that one network learns, where there are several; recipes set them in ``data``.
@@ -188,7 +188,7 @@ class LitPoseRegressor(L.LightningModule):
         return {name: value for name, value in self.hparams.items() if name in taken}
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None, scene: Tensor | None = None) -> PosePrediction:
-        """Localize images, (B, 3, H, W) in 0..1, of cameras (B, 3, 3) in pixels of them, in given scenes (B,)."""
+        """Localize images, (B, 3, H, W) in 0..1, of cameras (B, 3, 3) in their pixels, in given scenes (B,)."""
         return self.network(image, intrinsics, scene)
 
     def setup(self, stage: str) -> None:
@@ -368,7 +368,7 @@ class LitPoseRegressor(L.LightningModule):
             kwargs: hyperparameters that replace the stored ones.
 
         Raises:
-            InputError: where the file is missing, is no such checkpoint or holds anything but plain data.
+            InputError: where the file is missing, is not such a checkpoint or holds anything but plain data.
         """
         kwargs.pop("weights_only", None)  # Lightning's option, which might ask for more
         system = build_from(read_checkpoint(checkpoint_path), cls, strict is not False, **kwargs)

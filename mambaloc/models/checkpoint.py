@@ -70,7 +70,7 @@ class Checkpoint:
         for name in _FORMER_AUGMENTATION:
             arguments.pop(name, None)
         if not arguments:
-            raise InputError(f"{self.path}: holds no data settings; train it with mambaloc train")
+            raise InputError(f"{self.path}: contains no data settings; train it with mambaloc train")
         return build_data(**{**arguments, **changed})
 
     def scene_data(self, **changed: Any) -> PoseDataModule:

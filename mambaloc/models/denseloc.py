@@ -1,4 +1,4 @@
-"""DenseLoc: every cell of the feature map says where it looks, and the pose is solved from all of them."""
+"""DenseLoc: every cell of the feature map says where it looks, and the pose is solved from all answers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class DenseLoc(PoseNetwork):
         dropout: residual and MLP dropout of the encoder.
         head: ``dense``; or ``token``, the ablation that answers once, from the transformer's token.
         rotation: ``procrustes`` or ``quaternion``, see :class:`~mambaloc.nn.CellHead`.
-        position: ``votes`` or ``points``, likewise.
+        position: ``votes`` or ``points``: how the position is solved.
         gis: ``gis``, ``classical`` or ``none``: each cell's, in each branch.
         discretisation: of the state space: ``euler`` or ``zoh``.
         scenes: how many the network knows; the cells' mean says which one an image shows, and each has outputs of its

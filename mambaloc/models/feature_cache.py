@@ -31,7 +31,7 @@ class FeatureCache:
 
     Args:
         compute: images (B, 3, H, W) to features, a few (B, C, h, w).
-        sample: one image, (1, 3, H, W), whose features tell the shapes.
+        sample: one image, (1, 3, H, W), whose features have the shapes to expect.
         rows: how many training images there are.
         draws: how many augmentations each has.
         most_bytes: of the file.

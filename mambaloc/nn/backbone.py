@@ -1,4 +1,4 @@
-"""Backbones from timm, cut after what is used of them: feature maps, or one pooled feature."""
+"""Backbones from timm, cut after the last layer used: feature maps, or one pooled feature."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ImageBackbone(nn.Module):
         body: the module.
         weights: a ``.safetensors`` file, or None.
         pixel_mean: RGB mean in 0..1 that the body expects.
-        pixel_std: RGB deviation in 0..1, likewise.
+        pixel_std: RGB standard deviation in 0..1 to normalize with.
 
     Raises:
         InputError: for weights that are not there or do not fit.
@@ -100,7 +100,9 @@ class ImageBackbone(nn.Module):
             reason = str(error).splitlines()[-1].strip()  # load_state_dict's first line names no tensor
             raise InputError(f"backbone_weights {path}: does not fit {self.name} ({reason})") from None
         if missing:
-            raise InputError(f"backbone_weights {path}: lacks {len(missing)} tensors of {self.name}, as {missing[0]}")
+            raise InputError(
+                f"backbone_weights {path}: {len(missing)} tensors of {self.name} are missing, such as {missing[0]}"
+            )
 
 
 class Backbone(ImageBackbone):

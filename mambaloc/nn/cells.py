@@ -1,4 +1,4 @@
-"""A dense head and its cells: every cell of the feature map answers, and the pose is solved from all of them."""
+"""A dense head and its cells: every cell of the feature map answers, and the pose is solved from all answers."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class PositionScale(nn.Module):
         self.scale_m.view(-1)[scene] = spread_m
 
     def normalize(self, position_m: Tensor) -> Tensor:
-        """Tell positions in metres relative to the mean and scale of the only scene; (..., 3) -> (..., 3)."""
+        """Normalize positions in metres by the mean and scale of the only scene; (..., 3) -> (..., 3)."""
         return (position_m - self.mean_m) / self.scale_m
 
     @deprecated("PositionScale.normalise is now normalize. The old name is removed in the next release.")

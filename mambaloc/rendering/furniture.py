@@ -1,4 +1,4 @@
-"""Furniture made of boxes, each piece drawn anew by chance.
+"""Furniture made of boxes, each piece drawn at random.
 
 A piece stands in a frame of its own: ``x`` to the right along the wall behind it from 0 to its width, ``y`` into
 that wall, which is at 0, ``z`` up from the floor.

@@ -57,9 +57,9 @@ def verify_bundle(folder: Path, threads: int | None = None) -> list[Deviation]:
         for name, entry in files.items():
             _check(folder, name, entry["sha256"])
         if strange := next((frame["file"] for frame in frames if frame["file"] not in files), None):
-            raise InputError(f"{path}: speaks of the frame {strange}, but not of its digest; write the bundle anew")
+            raise InputError(f"{path}: lists the frame {strange} without its digest; write the bundle again")
         if not frames or not any("allowed" in entry for entry in files.values()):
-            raise InputError(f"{path}: holds no model, or no frame to check it by; write the bundle anew")
+            raise InputError(f"{path}: contains no model, or no frame to check it by; write the bundle again")
         if (in_map := bundle.get("map")) is None:
             return list(_replayed(folder, files, frames, threads))
         if MAP_FILE not in files:
@@ -69,7 +69,7 @@ def verify_bundle(folder: Path, threads: int | None = None) -> list[Deviation]:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}); give a bundle's folder") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         reason = f"{type(error).__name__}: {error}"
-        raise InputError(f"{path}: is no bundle's contract ({reason}); write the bundle anew") from None
+        raise InputError(f"{path}: is not a bundle's contract ({reason}); write the bundle again") from None
 
 
 def _check(folder: Path, name: str, digest: str) -> None:
@@ -79,7 +79,7 @@ def _check(folder: Path, name: str, digest: str) -> None:
     if strange or not path.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{folder / CONTRACT_FILE}: names {name}, outside of the bundle; do not use it")
     if sha256(path) != digest:
-        raise InputError(f"{path}: is not the file that the bundle was written with (sha256 differs); get it anew")
+        raise InputError(f"{path}: has another sha256 than the contract. Get the bundle again.")
 
 
 def _replayed(

@@ -30,7 +30,7 @@ class Pinhole:
 
     Args:
         width: of its images, in pixels.
-        height: likewise.
+        height: in pixels.
         focal_px: along x and y.
         centre_px: principal point, x and y.
     """

@@ -31,7 +31,7 @@ MODEL_FILES = {"onnx": "model.onnx", "fp16": "model.fp16.onnx", "int8": "model.i
 """What a bundle's models are called, by format, the most exact first."""
 
 UNCERTAINTY = ("position_radius_m", "rotation_radius_deg", "unfamiliarity")
-"""Outputs of a model that tells how sure it is."""
+"""Outputs of a model that estimates its uncertainty."""
 
 SCENE_PROBABILITY = "scene_probability"
 """Output of a model that knows several scenes: how likely the image shows each, (batch, scenes), of sum 1."""
@@ -99,7 +99,7 @@ class Contract:
         preprocessing: of its input.
         trained: provenance of its training: commit, seed, device, versions.
         weights_sha256: of its parameters and buffers, whatever precision they are stored in.
-        uncertainty: how its radii were measured, where it tells them: the share of poses within, on how many frames.
+        uncertainty: how its radii were measured, if the model has them: the share of poses within, on how many frames.
         intrinsics: the training camera's pinhole matrix in pixels of the crop, for a model that takes intrinsics; what
             it is fed where the camera is unknown.
         pose: frame, units and order of its outputs.
@@ -138,7 +138,7 @@ class Contract:
 
         Args:
             size: (height, width) of the camera's images.
-            intrinsics: (3, 3) pinhole matrix in pixels of them.
+            intrinsics: (3, 3) pinhole matrix in pixels of the cropped image.
         """
         assert self.intrinsics is not None  # of a model that takes them
         told = self.preprocessing
@@ -181,7 +181,10 @@ class Contract:
             data = json.loads(text)
             version, preprocessing = data["contract"], data["preprocessing"]
             if version != VERSION:
-                raise InputError(f"{where}: contract of version {version!r}, this reads {VERSION}; export it anew")
+                raise InputError(
+                    f"{where}: contract of version {version!r}, but version {VERSION} is expected. Export the "
+                    "model again."
+                )
             height, width = map(int, preprocessing["crop"])
             short_side = int(preprocessing["short_side"])
             if not all(1 <= pixels <= _MOST_PIXELS for pixels in (height, width, short_side)):
@@ -203,7 +206,7 @@ class Contract:
             )
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             reason = f"{type(error).__name__}: {error}"
-            raise InputError(f"{where}: its contract cannot be read ({reason}); export the model anew") from None
+            raise InputError(f"{where}: its contract cannot be read ({reason}); export the model again") from None
 
 
 def _matrix(rows: Any, size: tuple[int, int]) -> tuple[tuple[float, float, float], ...]:

@@ -24,10 +24,10 @@ class Noise:
         position_m: error of a measured position.
         rotation_deg: of a measured rotation.
         acceleration_m_s2: averaged over a second; it is white, so over a quarter of one it is twice as much.
-        acceleration_deg_s2: of the rotation, likewise.
+        acceleration_deg_s2: the same of the rotation.
 
     Raises:
-        InputError: for one that is no positive number.
+        InputError: for one that is not a positive number.
     """
 
     position_m: float = 0.2
@@ -45,7 +45,7 @@ class Noise:
         """What errors a video's poses seem to have where a hand moves the camera.
 
         A pose's distance from the line between those a quarter of a second before and after shows an error, less what
-        motion adds. The far fifth of distances are outliers, and errors are twice what the others show, as much of them
+        motion adds. The far fifth of distances are outliers, and errors are twice what the others show, as much of each
         is common to all three (half or twice as much made little difference on frames held out, and on rendered ones).
 
         Args:

@@ -29,7 +29,7 @@ class Localization:
         no pose. ``covariance`` (6, 6).
 
     Args:
-        position_m: in the scene's frame; as :class:`~mambaloc.runtime.Localizer` tells it, in the world of the data
+        position_m: in the scene's frame; as :class:`~mambaloc.runtime.Localizer` returns it, in the world of the data
             that the scene was made of.
         quaternion: of the same pose.
         latency_s: seconds that it took, without decoding the image.
@@ -37,7 +37,7 @@ class Localization:
             map's pose is accepted; None where neither says.
         rotation_radius_deg: the same of the rotation.
         unfamiliarity: how far the image is from those that the network was trained on; over 1, hardly any frame of the
-            place is. None where the model does not tell.
+            place is. None if the model does not estimate it.
         source: what found the pose; None where nothing did.
         inliers: matches that agree with the map's pose, accepted or not; None where there is no map.
         covariance: where the map's pose is accepted, of the position in metres, then of the rotation in radians about
@@ -45,7 +45,7 @@ class Localization:
         focal_scale: how many times the given focal length the map's matches ask for; None where they do not contradict
             it, and where there is no map.
         scene: name of the scene that the image shows, in whose frame the pose is, where the network knows several. An
-            unfamiliar image shows none of them.
+            unfamiliar image shows no known scene.
         scene_probability: of that scene, against the others.
     """
 
@@ -71,7 +71,7 @@ class Localization:
     def is_unfamiliar(self) -> bool:
         """Whether the image does not look like the place, so that the network's pose says nothing.
 
-        False where the map answers, and where none can tell.
+        False where the map answers, and for models without an estimate.
         """
         return self.source != "map" and self.unfamiliarity is not None and not self.unfamiliarity <= 1
 

@@ -121,11 +121,11 @@ class Localizer:
                 lens, which says the intrinsics.
 
         Raises:
-            InputError: for a file that is missing or no whole image, or an array of another kind; for an image that
-                does not hold the network's crop, unless the network is given its intrinsics; for intrinsics that cannot
-                be the image's, where the network takes them or there is a map alone; and, in a map alone, for an image
-                of another shape without them; for a distorted image where no lens is known, or of another shape than
-                its, or with intrinsics.
+            InputError: for a file that is missing, truncated or not an image, or an array of another kind; for an image
+                smaller than the network's crop, unless the network is given its intrinsics; for intrinsics that cannot
+                be the image's, where the network takes them or there is a map alone; in a map alone, for an image of
+                another shape without intrinsics; for a distorted image with intrinsics, without a known lens, or of
+                another shape than the lens's.
         """
         rgb = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
         start = time.perf_counter()
@@ -153,7 +153,7 @@ class Localizer:
         Args:
             source: as :func:`~mambaloc.runtime.sources.frames_of` takes it, or the frames that it gives.
             intrinsics: of every frame, as :meth:`localize` takes them.
-            is_distorted: likewise.
+            is_distorted: the frames are as the training camera stores them.
 
         Raises:
             InputError: where there is no such source, or as :meth:`localize`.
@@ -212,7 +212,7 @@ def _model_file(path: Path) -> Path:
         return path
     found = [path / name for name in MODEL_FILES.values() if (path / name).is_file()]
     if not found:
-        raise InputError(f"{path}: holds none of {', '.join(MODEL_FILES.values())}; give a bundle of mambaloc export")
+        raise InputError(f"{path}: contains no {' or '.join(MODEL_FILES.values())}; give a bundle of mambaloc export")
     return found[0]
 
 

@@ -39,7 +39,7 @@ class Network:
             self._session = onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime's own exceptions share no base
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError(f"{self.path}: ONNX Runtime cannot load it ({reason}); export it anew") from None
+            raise InputError(f"{self.path}: ONNX Runtime cannot load it ({reason}); export it again") from None
         metadata = self._session.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
             raise InputError(f"{self.path}: carries no contract of its input; export it with mambaloc export")
@@ -81,12 +81,12 @@ class Network:
         """The metadata and the graph may come from two hands."""
         outputs = [output.name for output in self._session.get_outputs()]
         if outputs != list(self.contract.outputs):
-            raise InputError(f"{self.path}: says {outputs}, as its contract does not; export it anew")
+            raise InputError(f"{self.path}: outputs {outputs} do not match its contract. Export the model again.")
         told, (given, *others) = self.contract.preprocessing, self._session.get_inputs()
         expected = ("tensor(uint8)", [3]) if told.in_model else ("tensor(float)", [3, *told.crop])
         if (given.type, given.shape[-len(expected[1]) :]) != expected:
             raise InputError(
-                f"{self.path}: takes {given.type} {given.shape}, as its contract does not say; export it anew"
+                f"{self.path}: input {given.type} {given.shape} does not match its contract. Export the model again."
             )
         cameras = [(other.name, other.type, other.shape[-2:]) for other in others]
         if cameras != ([] if self.contract.intrinsics is None else [(INTRINSICS_INPUT, "tensor(float)", [3, 3])]):

@@ -5,7 +5,7 @@ position, velocity, rotation and angular velocity; its error is a vector of 12 w
 axes. The smoother goes back over what the filter found (Rauch, Tung and Striebel 1965).
 filterpy is not used: its filters have Euclidean states only, and no error state for a rotation.
 
-A network errs alike on frames that look alike, so its errors are not white: filtering takes away jitter and leaps, but
+A network's errors on neighbouring frames are correlated, not white: filtering takes away jitter and leaps, but
 little of the error that neighbours share.
 
 Convention
@@ -48,7 +48,7 @@ class PoseEstimate:
 
     Args:
         position_m: camera centre in the scene's frame.
-        quaternion: likewise.
+        quaternion: its rotation, wxyz.
         velocity_m_s: rate of the position.
         turn_rad_s: rate of the rotation.
         covariance: of the error, as the head of this file says.
@@ -69,7 +69,7 @@ class PoseFilter:
     """Filters poses as they come: each gives the best one at its time, at once, from those until then.
 
     A pose that is farther from the expected one than the gate allows is left out, and so is one that is not finite; the
-    fifth in a row is believed, and the filter begins anew with it.
+    fifth in a row is believed, and the filter begins again with it.
 
     Args:
         noise: what to believe. Unless given, errors are learned from the last 300 poses, and the first 19 are given
@@ -122,12 +122,12 @@ def smooth(
 ) -> list[PoseEstimate]:
     """Filter a whole video: each pose from those before and after it.
 
-    Where a jump is believed, the smoother begins anew with the first of the poses that were left out in a row.
+    Where a jump is believed, the smoother begins again with the first of the poses that were left out in a row.
 
     Args:
         time_s: (N,), in order.
-        position_m: (N, 3), the first of them finite.
-        quaternion: (N, 4), likewise.
+        position_m: (N, 3), the first one finite.
+        quaternion: (N, 4), the first one finite.
         noise: what to believe; errors are learned from all poses unless given.
 
     Raises:

@@ -59,7 +59,9 @@ def frames_of(
     if path.is_dir():
         paths = list_images(path)
         if not paths:
-            raise InputError(f"{path}: holds no image ({', '.join(IMAGE_SUFFIXES)}); give a folder of them or a video")
+            raise InputError(
+                f"{path}: contains no image ({', '.join(IMAGE_SUFFIXES)}); give a folder of images or a video"
+            )
         return _of_images(paths, pictures_hz, counts), len(paths)
     if not path.is_file():
         if str(source).isdecimal():
@@ -101,7 +103,7 @@ def _opened(what: str | int, name: str) -> cv2.VideoCapture:
 
 
 def _of_capture(capture: cv2.VideoCapture, live: bool = False) -> Iterator[SourceFrame]:
-    """Frames with times that always grow; a camera's are the clock's, as few cameras tell theirs."""
+    """Frames with times that always grow; a camera's are the clock's, as few cameras state theirs."""
     rate_hz = capture.get(cv2.CAP_PROP_FPS)
     frame_s = 1 / rate_hz if rate_hz > 0 else 1 / 30
     began_s, time_s = 0.0, -frame_s

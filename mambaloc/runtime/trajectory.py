@@ -22,7 +22,7 @@ def stamp(time_s: float | Decimal) -> str:
 
 
 def write_tum(path: Path, time_s: Iterable[float | Decimal], position_m: Any, quaternion: Any) -> None:
-    """Write lines ``timestamp tx ty tz qx qy qz qw``, all or none of them.
+    """Write lines ``timestamp tx ty tz qx qy qz qw``, all or none.
 
     TUM puts the scalar last, unlike everything else here. Rows without a pose, of zeros or NaN, are left out: evo takes
     zeros for a pose at the origin. Positions are written in the world that they are given in.

@@ -43,7 +43,7 @@ class Undistortion:
     Args:
         lens: of the camera; None where it is not known.
         stored: (width, height) of the images that it stores.
-        leaves: the pinhole whose images are left, the middle of them where they were cropped.
+        leaves: the pinhole camera of the undistorted images, of their middle if they were cropped.
         unknown: why the lens is not known.
     """
 

@@ -34,8 +34,8 @@ class Followed:
         from_map: of the poses, those that the map found; None unless it stands beside a network.
         outliers: of the poses, those that a filter left out; None where there was no filter.
         latency_ms: median of a frame.
-        unfamiliar: of the frames, those that do not look like the place; none where that cannot be said.
-        radii: medians of what nine of ten poses are within, in metres and degrees, where that can be said.
+        unfamiliar: of the frames, those that do not look like the place; None if the model does not estimate it.
+        radii: medians of what nine of ten poses are within, in metres and degrees; None if unknown.
     """
 
     scene: str
@@ -48,7 +48,7 @@ class Followed:
     radii: tuple[float, float] | None = None
 
     def __str__(self) -> str:
-        """As a tool prints it: one line, and another where it can be said how far off poses are."""
+        """Format for a terminal: one line, and another with the uncertainty of poses where it is known."""
         details = [] if self.outliers is None else [f"{self.outliers} outliers"]
         if self.from_map is not None:
             details += [f"{self.from_map} from the map, {self.count - self.from_map} from the network"]
@@ -89,7 +89,7 @@ def follow(
         on_frame: is given each frame and what was found of it, unfiltered.
 
     Raises:
-        InputError: where there is no such source, it holds no frame, one cannot be localized, none has a pose, or
+        InputError: where there is no such source, it has no frame, one cannot be localized, none has a pose, or
             ``out`` has no folder.
     """
     if out.is_dir() or not out.absolute().parent.is_dir():
@@ -116,7 +116,7 @@ def follow(
                 positions_m, quaternions, outliers = _filtered(filtering, times_s, poses)
             write_tum(out, times_s, positions_m, quaternions)
     if not found:
-        raise InputError(f"{source}: holds no frame; give another video")
+        raise InputError(f"{source}: has no frame; give another video")
     if not kept:
         raise InputError(f"{source}: none of its {len(found)} frames was localized. Give frames of the map's place.")
     return summarize(localizer, [pose for _, pose in found], outliers)

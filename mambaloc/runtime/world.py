@@ -14,7 +14,7 @@ _LARGEST = 1e12
 
 @dataclass(frozen=True)
 class World:
-    """A shift, which is removed while numbers are float64, so that float32 holds the rest, and undone in what is told.
+    """A shift, which is removed while numbers are float64, so that float32 holds the rest, and undone in results.
 
     Args:
         offset_m: of the scene's origin in its source's world, in metres or the scene's unit.

@@ -57,7 +57,7 @@ class Limits:
 
 
 class _Metrics:
-    """What Prometheus is told."""
+    """Metrics for Prometheus."""
 
     def __init__(self, workers: Workers) -> None:
         self.registry = CollectorRegistry()
@@ -140,10 +140,10 @@ class _Endpoints:
             form = await parser.parse()
         except (MultiPartException, KeyError) as error:
             rule = getattr(error, "message", "no boundary is named")
-            raise HTTPException(400, f"body: is no form of at most {self.limits.pictures} files ({rule}).") from None
+            raise HTTPException(400, f"body: is not a form of at most {self.limits.pictures} files ({rule}).") from None
         files = [file for _, file in form.multi_items() if isinstance(file, UploadFile)]
         if not files:
-            raise HTTPException(400, "body: the form holds no file. Give an image for each field.")
+            raise HTTPException(400, "body: the form contains no file. Give an image for each field.")
         try:
             return [await file.read() for file in files]
         finally:

@@ -37,7 +37,7 @@ _ENVIRONMENT = {  # of a worker: it has a core, and the memory of images that ca
 }
 
 Answer = dict[str, Any]
-"""What is said of an image, ready for JSON: its pose, or ``error``, the rule that it breaks."""
+"""Describe an image's result for JSON: its pose, or ``error``, the rule that it breaks."""
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def paper_tables(trials: Iterable[StoredTrial], epoch: str = "last") -> list[Pap
     """Lay out every table of the paper.
 
     Args:
-        trials: of a store; those that failed or lack the epoch are left out.
+        trials: of a store; those that failed or do not have the epoch are left out.
         epoch: ``last`` or ``best``.
     """
     by_basis: dict[Basis, list[StoredTrial]] = {}
@@ -76,7 +76,7 @@ def paper_tables(trials: Iterable[StoredTrial], epoch: str = "last") -> list[Pap
 
 @cache
 def printed_tables() -> dict[str, dict[str, Any]]:
-    """The tables as ``paper.yaml`` tells them."""
+    """Read the tables from ``paper.yaml``."""
     return yaml.safe_load(files("mambaloc.sweep").joinpath("paper.yaml").read_text(encoding="utf-8"))
 
 
@@ -115,7 +115,7 @@ def _table(name: str, told: dict[str, Any], by_basis: dict[Basis, list[StoredTri
     if any("±" in cell for line in lines for cell in line):
         notes.append("±: standard deviation over seeds.")
     if any(column.get("what") == "mib" for column in columns):
-        notes.append("Sizes of ours count what the published models carry too; mambaloc benchmark sizes tells both.")
+        notes.append("Sizes of ours count what the published models carry too; mambaloc benchmark sizes prints both.")
     return PaperTable(name, told["title"], lines, notes + told["footnotes"], len(lines) > 1 + len(told["rows"]))
 
 

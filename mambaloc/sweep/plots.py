@@ -33,7 +33,7 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
 
     Args:
         rows: of a store.
-        series: the axis whose labels are told by colour, if any.
+        series: the axis whose labels have a colour each, if any.
     """
     plots = [Plot("Errors", "Means over seeds of median errors, with their intervals.", _dots(rows, series))]
     first = next(iter(rows[0].labels))

@@ -104,5 +104,5 @@ class SweepProgress:
             table.add_row(name, str(timedelta(seconds=int(time.monotonic() - since))))
         left = self.seconds_left()
         soon = "" if left is None else f", about {timedelta(seconds=int(left))} left"
-        counts = f"{self._ended} of {self._total} trials ended, {len(self._failures)} of them failed{soon}"
+        counts = f"{self._ended} of {self._total} trials ended, {len(self._failures)} failed{soon}"
         return Group(Text(counts), table, *map(Text, self._failures[-_FAILURES:]))

@@ -30,21 +30,21 @@ def write_report(
     Args:
         store: folder of a store.
         out: the folder, which must not be there yet.
-        comparisons: of an axis, its label before, and after: differences on the same frames. Plots tell the first
+        comparisons: of an axis, its label before, and after: differences on the same frames. Plots show the first
             one's labels by colour.
         epoch: ``last`` or ``best``.
-        reach_m: position error whose training seconds are told; retrieval's, where that was measured, unless given.
+        reach_m: position error whose training seconds are reported; retrieval's, where that was measured, unless given.
 
     Returns:
         The rows, and the trials that failed.
 
     Raises:
-        InputError: where no trial has ended, a comparison's label is none, or the folder cannot be written.
+        InputError: where no trial has ended, a comparison's label is unknown, or the folder cannot be written.
     """
     trials = list(Store.ended(store).values())
     rows, failed = rows_of(trials, epoch), [trial for trial in trials if trial.error is not None]
     if not rows:
-        raise InputError(f"{store}: holds no result of the {epoch} epoch; run a sweep into it first")
+        raise InputError(f"{store}: contains no result of the {epoch} epoch; run a sweep into it first")
     if out.exists():
         raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
     sections = [_results(rows), *_with_maps(rows)]
@@ -195,7 +195,7 @@ def _failures(failed: Sequence[StoredTrial]) -> Section:
 
 
 def _signed(figure: Figure) -> str:
-    sure = "" if figure.is_sure else ", may be none"
+    sure = "" if figure.is_sure else ", may be 0"
     return f"{figure.mean:+.3f} ({figure.low:+.3f} to {figure.high:+.3f}{sure})"
 
 

@@ -156,13 +156,13 @@ def _frames(predictions: Path) -> dict[str, Any]:
 
 
 def _why(code: int, output: Path) -> str | None:
-    """Why a process failed: the last line that it said, or what killed it."""
+    """Why a process failed: the last line of its output, or the signal that killed it."""
     if code == 0:
         return None
     if code in (-signal.SIGKILL, 128 + signal.SIGKILL):
         return "was killed, as when memory runs out"
     lines = [line.strip() for line in output.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1][:500] if lines else f"ended with code {code}, and said nothing"
+    return lines[-1][:500] if lines else f"ended with code {code}, without a message"
 
 
 def _outcome(future: Future[Outcome]) -> Outcome:

@@ -58,7 +58,7 @@ class Store:
     """The results of a sweep in a folder; a context manager.
 
     Args:
-        folder: holds ``results.sqlite``, and is made where there is none.
+        folder: holds ``results.sqlite``, and is made if missing.
 
     Raises:
         InputError: where it cannot be written, or holds another kind of file of that name.
@@ -81,14 +81,14 @@ class Store:
         except sqlite3.OperationalError as error:
             raise InputError(f"{self.path}: cannot be written ({error}); choose another --out") from None
         except sqlite3.Error as error:
-            raise InputError(f"{self.path}: is no store of results ({error}); choose another --out") from None
+            raise InputError(f"{self.path}: is not a store of results ({error}); choose another --out") from None
 
     def _is_old(self) -> bool:
         return bool(self._database.execute("SELECT 1 FROM sqlite_master WHERE name = 'cells'").fetchone())
 
     @classmethod
     def ended(cls, folder: Path) -> dict[str, StoredTrial]:
-        """What :meth:`read` says of a folder's store; nothing where there is none, which is not made."""
+        """Return :meth:`read` of a folder's store; empty without one, which is not made."""
         if not (folder / STORE_FILE).is_file():
             return {}
         with cls(folder) as store:
@@ -140,5 +140,5 @@ class Store:
     def _told(self, remedy: str) -> Iterator[None]:
         try:
             yield
-        except (sqlite3.Error, ValueError, TypeError, RecursionError) as error:  # a damaged row is no JSON, or no text
+        except (sqlite3.Error, ValueError, TypeError, RecursionError) as error:  # a damaged row is not JSON, or no text
             raise InputError(f"{self.path}: cannot be used ({str(error).splitlines()[0]}); {remedy}") from None

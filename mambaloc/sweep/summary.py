@@ -31,7 +31,7 @@ class Figure:
     Args:
         mean: over the seeds.
         low: end of the interval, by bootstrap over blocks of frames, all seeds resampled alike.
-        high: likewise.
+        high: end of the interval.
     """
 
     mean: float
@@ -95,7 +95,7 @@ class Difference:
         labels: the place, without the axis and the seed; ``ALL`` on the first axis for the mean over it.
         errors: a figure for each of ``ERRORS``: negative where the change helps.
         step_ratio: training seconds a step after the change to those before it, a pair each.
-        reach_ratio: steps to the worse of the two last errors, likewise; empty where no curve was kept.
+        reach_ratio: steps to the worse of the two last errors, as a ratio; empty where no curve was kept.
     """
 
     labels: dict[str, str]
@@ -105,7 +105,7 @@ class Difference:
 
 
 def rows_of(trials: Iterable[StoredTrial], epoch: str = "last") -> list[Row]:
-    """Put the trials of each place together; those that failed, or lack the epoch, are left out.
+    """Put the trials of each place together; those that failed, or do not have the epoch, are left out.
 
     Args:
         trials: of a store.

@@ -1,7 +1,7 @@
 """Run a command for as long as whoever asked for it lives: python supervised.py COMMAND [WORD ...].
 
 The asker holds the other end of stdin, which closes however it ends, ``kill -9`` included; then this process's whole
-group is killed, so that no training goes on which nobody waits for. The group must be its own. Where this process is
+group is killed, so that no orphaned training goes on. The group must be its own. Where this process is
 killed itself, as Ray does to what its workers started, Linux ends the command.
 """
 

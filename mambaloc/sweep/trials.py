@@ -54,7 +54,7 @@ class Sweep:
         trials: every combination that is not excluded.
         time_limit_s: of one trial; one that takes longer is stopped, and has failed.
         cpus: that one trial takes.
-        gpus: likewise; a fraction shares one.
+        gpus: GPUs of a trial; a fraction shares one.
     """
 
     trials: tuple[Trial, ...]
@@ -80,9 +80,9 @@ def read_sweep(path: Path) -> Sweep:
         gpus: 0
 
     Raises:
-        InputError: where the file is none, or names what is not there.
+        InputError: where the file is not a sweep, or names what does not exist.
     """
-    told = read_yaml(path, "give a sweep of trainings", "mend it")
+    told = read_yaml(path, "give a sweep of trainings", "repair it")
     if not isinstance(told, dict) or not isinstance(told.get("axes"), dict) or not told["axes"]:
         raise InputError(f"{path}: names no axes; a sweep has 'axes', each with labels and their arguments")
     for old, new in _RENAMED.items():

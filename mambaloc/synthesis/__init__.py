@@ -1,4 +1,4 @@
-"""Novel views: images at poses where nobody took one, rendered from posed frames with depth."""
+"""Novel views: images at poses without a real one, rendered from posed frames with depth."""
 
 from mambaloc.synthesis.consistency import agreement, confirmed, without_disagreeing
 from mambaloc.synthesis.depth_from_pictures import depth_from_pictures

@@ -33,7 +33,7 @@ def depth_from_pictures(
     settings: SweepSettings | None = None,
     device: torch.device | str = "cpu",
 ) -> PosedDepth:
-    """Search depth for some of the images, spread over the poses, and keep what several of them confirm.
+    """Search depth for some of the images, spread over the poses, and keep depths that several images confirm.
 
     Args:
         images: (N, 3, h, w) uint8.
@@ -58,8 +58,7 @@ def depth_from_pictures(
     found = confirmed(PosedDepth(images[rows], depth_m, intrinsics[rows], world_from_cam[rows]))
     if np.isfinite(found.depth_m).mean() < _LEAST_KNOWN:
         raise InputError(
-            f"{len(images)} images: no depth is found that several of them confirm. Check poses and cameras, or "
-            "do without views."
+            f"{len(images)} images: several images confirm no depth. Check poses and cameras, or do without views."
         )
     return found
 

@@ -139,7 +139,7 @@ class PlaneSweep:
 
 
 def best_half(costs: Tensor) -> Tensor:
-    """Mean of the smaller half of the costs that are not NaN; 1 where there are none; (K, ...) -> (...)."""
+    """Mean of the smaller half of the costs that are not NaN; 1 where all are NaN; (K, ...) -> (...)."""
     smallest = [torch.full_like(costs[0], torch.inf) for _ in range((len(costs) + 1) // 2)]
     for cost in costs.nan_to_num(torch.inf):  # inserted into place one by one: sorting takes longer
         for rank, kept in enumerate(smallest):

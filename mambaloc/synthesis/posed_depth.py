@@ -45,7 +45,7 @@ class PosedDepth:
         return np.hypot(offset / self.median_depth_m, turn_rad)
 
     def select(self, rows: Rows) -> PosedDepth:
-        """Some of them."""
+        """Select some rows."""
         return PosedDepth(self.images[rows], self.depth_m[rows], self.intrinsics[rows], self.world_from_cam[rows])
 
     def digest(self) -> str:

@@ -44,7 +44,7 @@ class Spread:
 
 
 class PoseSampler:
-    """Draws poses: one of the frames' or, as often, a point between two of them, plus normal noise of one
+    """Draws poses: one of the frames' or, as often, a point between two frames, plus normal noise of one
     of two sizes.
 
     Args:

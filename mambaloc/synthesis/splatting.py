@@ -1,4 +1,4 @@
-"""Views of a scene at poses where nobody took an image, from frames with depth.
+"""Views of a scene at poses without a real image, from frames with depth.
 
 The depth of the nearest frames is splatted into the new camera with a z-buffer, whose cracks are closed. Each pixel is
 then looked up in the frames: the best-ranked one whose depth agrees within 5 % gives its colour, between pixels.
@@ -152,7 +152,7 @@ class Splatter:
         return images.clamp_(0, 255).round_().byte(), depth_m
 
     def _z_buffer(self, frames: NDArray[np.int64], to_view: Tensor, size: torch.Size) -> Tensor:
-        """Depth (H, W) of the nearest point of some frames on each pixel of a view; infinite where there is none."""
+        """Depth (H, W) of the nearest point of some frames on each pixel of a view; infinite without a point."""
         height, width = size
         buffer = to_view.new_full(((height + 2) * (width + 2),), torch.inf)  # a border takes what lies outside
         if len(frames):

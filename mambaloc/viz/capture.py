@@ -43,7 +43,7 @@ def draw_capture(
         forward: unit, where each camera looks, (N, 3).
         up: unit, (3,): an axis of the world where one points up, whose other axes are then kept.
         split: of each frame.
-        sequences: likewise; lines do not cross from one to the next.
+        sequences: of each frame; lines do not cross from one to the next.
         jumps: rows that the camera jumps to.
         path: the PNG to write.
         title: heads the plot.

@@ -42,7 +42,7 @@ class Gap:
 
     Args:
         place: in the plane that is drawn.
-        direction: likewise, of unit length.
+        direction: of view, of unit length.
         matches: points that a camera there may be expected to match.
     """
 

@@ -72,7 +72,7 @@ def grad_cam(reading: Reading) -> Tensor:
     """Weigh a map's channels by their mean gradients and sum them; the magnitude, 0..1 in each frame.
 
     The original keeps positive values, which speak for its class. A pose has no class to speak against: what draws it
-    nearer to the mean tells as much as what drives it away, and many a frame would have no positive value at all.
+    nearer to the mean is as informative as what drives it away, and many a frame would have no positive value at all.
 
     Shape:
         (B, C, rows, columns) -> (B, rows, columns).

@@ -31,7 +31,7 @@ def write_scene_page(
 ) -> None:
     """Write a split's true path (green) and predicted positions (red, darker where the rotation is more wrong).
 
-    Pointing at a position tells its frame and errors.
+    Pointing at a position shows its frame and errors.
 
     Args:
         table: errors of the split, one row a frame.
@@ -107,7 +107,7 @@ def _told(names: Sequence[str], errors_m: Iterable[float], errors_deg: Iterable[
 
 
 def _offsets(table: PoseErrorTable, told: Sequence[str]) -> Any:
-    """Thin lines from each true position to the predicted one; they end in its marker, so they tell the same."""
+    """Thin lines from each true position to the predicted one; they end in its marker, so they show the same."""
     from plotly.graph_objects import Scatter3d
 
     true_m, predicted_m = table.true_position_m.cpu().numpy(), table.predicted_position_m.cpu().numpy()

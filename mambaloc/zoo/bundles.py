@@ -32,7 +32,7 @@ def load_with_data(
 ) -> tuple[LitPoseRegressor, PoseDataModule | MultiSceneDataModule]:
     """Load a trained system, and the scene that it knows.
 
-    A checkpoint tells all about its data; a released model only which scene: its whole training split is then meant.
+    A checkpoint has all about its data; a released model only the scene: its whole training split is then meant.
 
     Args:
         source: as :func:`mambaloc.load` takes it.
@@ -73,7 +73,7 @@ def map_of(source: str) -> Path | None:
         source: as :func:`mambaloc.load` takes it.
 
     Returns:
-        The file; None where there is none.
+        The file; None without one.
 
     Raises:
         InputError: where there is no released model of this name, or its map is not the file that was released.

@@ -82,7 +82,7 @@ def released_folder(source: str) -> Path:
     """The folder of a released model: ``ARCH.TAG``, ``local-dir:FOLDER``, or ``hf-hub:ORG/NAME@REVISION``.
 
     Raises:
-        InputError: where there is none of this name.
+        InputError: if there is no model of this name.
     """
     kind, colon, rest = source.partition(":")
     if colon and kind == "local-dir":
@@ -117,7 +117,7 @@ def load_released(folder: Path) -> LitPoseRegressor:
 
 
 def released_map(folder: Path) -> Path | None:
-    """The sparse map that was released with a model, its digest checked; None where there is none.
+    """The sparse map that was released with a model, its digest checked; None without one.
 
     Raises:
         InputError: where the manifest is wrong, or the file is missing or another.
@@ -133,9 +133,9 @@ def _released_bytes(path: Path, digest: str) -> bytes:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); get the model anew") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror}); get the model again") from None
     if hashlib.sha256(content).hexdigest() != digest:
-        raise InputError(f"{path}: is not the file that its manifest speaks of (sha256 differs); get the model anew")
+        raise InputError(f"{path}: has another sha256 than its manifest. Get the model again.")
     return content
 
 

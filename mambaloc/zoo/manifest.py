@@ -80,7 +80,7 @@ class Manifest:
     map_bytes: int | None = None
 
     def to_yaml(self) -> str:
-        """Write it down, without what is None."""
+        """Write the manifest without fields that are None."""
         known = {name: value for name, value in asdict(self).items() if value is not None}
         data = {"manifest": VERSION, **known, "results": [asdict(result) for result in self.results]}
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=120)
@@ -93,9 +93,9 @@ class Manifest:
             InputError: where it is missing or not one, or gives a figure without its provenance.
         """
         path = folder / MANIFEST_FILE
-        data = read_yaml(path, "give a released model's folder", "get it anew")
+        data = read_yaml(path, "give a released model's folder", "get it again")
         if not isinstance(data, dict) or data.pop("manifest", None) != VERSION:
-            raise InputError(f"{path}: is no manifest of version {VERSION}; publish the model anew")
+            raise InputError(f"{path}: expected a manifest of version {VERSION}. Publish the model again.")
         _check(path, "manifest", data, cls)
         results = [_checked_result(path, number, entry) for number, entry in enumerate(data.pop("results"), start=1)]
         return cls(results=tuple(results), **data)
@@ -115,7 +115,7 @@ _KINDS: dict[str, Any] = {
 
 def _checked_result(path: Path, number: int, entry: Any) -> Result:
     if not isinstance(entry, dict):
-        raise InputError(f"{path}: result {number} is no mapping; publish the model anew")
+        raise InputError(f"{path}: result {number}: expected a mapping. Publish the model again.")
     _check(path, f"result {number}", entry, Result)
     return Result(**entry)
 
@@ -125,10 +125,12 @@ def _check(path: Path, what: str, data: dict[str, Any], kind: type) -> None:
     expected = {field.name: _KINDS[str(field.type)] for field in fields(kind)}
     needed = [field.name for field in fields(kind) if field.default is MISSING]
     if missing := [name for name in needed if data.get(name) in (None, "")]:
-        raise InputError(f"{path}: {what} lacks {', '.join(missing)}; nothing is told without where it came from")
+        raise InputError(f"{path}: {what}: missing field {', '.join(missing)}. Every result states its provenance.")
     if unknown := sorted(set(map(str, data)) - set(expected)):
-        raise InputError(f"{path}: {what} has {', '.join(unknown)}, which no manifest has; publish the model anew")
+        raise InputError(
+            f"{path}: {what}: unknown field {', '.join(unknown)}. Publish the model again with this version."
+        )
     for name, value in data.items():
         types = expected[name]
         if not isinstance(value, types) or (isinstance(value, bool) and types is not bool):
-            raise InputError(f"{path}: {what}'s {name} is {value!r}; publish the model anew")
+            raise InputError(f"{path}: {what}: {name} is {value!r}, not of its type. Publish the model again.")

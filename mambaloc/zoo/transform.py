@@ -32,7 +32,7 @@ class Transform:
             image: a file, which is read upright; or ``uint8`` (H, W, 3) RGB, (H, W) grey or (H, W, 4).
 
         Raises:
-            InputError: where it is no whole image.
+            InputError: if it is truncated or not an image.
         """
         pixels = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
         cropped = self.preprocessing.apply(pixels)

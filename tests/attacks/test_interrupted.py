@@ -39,7 +39,7 @@ def test_killed_before_any_step(name, inputs, undisturbed, tmp_path, tries, tall
         out = tmp_path / f"step {step}"
         assert outcome_of(subject, inputs, out, partial(kill_before, step))[0] is None
         finished = subject.check(out)
-        tally(f"{name}: kill -9 before a step", "whole by then" if finished else "nothing to read, made anew")
+        tally(f"{name}: kill -9 before a step", "whole by then" if finished else "nothing to read, made again")
         assert_goes_on(subject, inputs, out)
 
 

@@ -103,7 +103,12 @@ def test_overlays_say_model_data_and_trainer(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [(None, "cannot be read"), ("{", "is no YAML"), ("- 1", "says nothing of model"), ("early_stopping: 1", "nothing")],
+    [
+        (None, "cannot be read"),
+        ("{", "is not YAML"),
+        ("- 1", "says nothing of model"),
+        ("early_stopping: 1", "nothing"),
+    ],
 )
 def test_no_overlay(text, message, tmp_path):
     path = tmp_path / "o.yaml"

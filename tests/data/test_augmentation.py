@@ -20,7 +20,7 @@ def images(count: int, low: int = 0, high: int = 256, size: tuple[int, int] = SI
 
 
 def smooth_images(count: int) -> Tensor:
-    """Gradients of colour between 90 and 160, as photographs are: neighbours are alike, and nothing clips."""
+    """Gradients of colour between 90 and 160, as photos are: neighbours are alike, and nothing clips."""
     rows, columns = torch.meshgrid(torch.linspace(0, 1, SIZE[0]), torch.linspace(0, 1, SIZE[1]), indexing="ij")
     weights = torch.rand(count, 3, 2, generator=torch.Generator().manual_seed(2))[..., None, None]
     return (90 + 35 * (weights[:, :, 0] * rows + weights[:, :, 1] * columns)).round().to(torch.uint8)

@@ -324,7 +324,7 @@ def test_depth_that_cannot_be_used_gives_way_to_the_pictures_unless_it_was_asked
     expected = {
         "thousandth": disagrees,
         "thousandfold": disagrees,
-        "empty": r"depth.png: depth has no measured pixel, and no other depth frame can be used. Mend them, or set",
+        "empty": r"depth.png: depth has no measured pixel, and no other depth frame can be used. Repair them, or set",
         "none": "no training frame has depth. Set data.view_depth to images",
         "few": "10 of 40 training frames have depth, too few",
     }[change]

@@ -69,7 +69,7 @@ CHOOSE = """(source) => {
 
 @pytest.fixture
 def opened(load, address):
-    """Opens the page at a source, as it is after another one; its console holds no error when the test ends."""
+    """Opens the page at a source, as it is after another one; its console contains no error when the test ends."""
     console = []
 
     def open_(source, where=address):

@@ -159,10 +159,10 @@ def test_a_bad_description_of_a_map_is_refused(mapped):
 
     files = {name: entry for name, entry in whole["files"].items() if name != "map.safetensors"}
     refused({**whole, "files": files}, "describes a map without the digest")
-    refused({**whole, "map": 3}, "is no bundle's contract")
-    refused({**whole, "map": {"allowed": {}}}, "is no bundle's contract")
+    refused({**whole, "map": 3}, "is not a bundle's contract")
+    refused({**whole, "map": {"allowed": {}}}, "is not a bundle's contract")
     frames = [{**frame, "map": 3} for frame in whole["frames"]]
-    refused({**whole, "frames": frames}, "is no bundle's contract")
+    refused({**whole, "frames": frames}, "is not a bundle's contract")
     frames = [{**frame, "intrinsics": [1]} for frame in whole["frames"]]
     refused({**whole, "frames": frames}, "cannot be the camera")
     (mapped / "map.safetensors").write_bytes(b"noise")
@@ -304,8 +304,8 @@ def test_a_contract_that_is_none_is_refused(copied):
         with pytest.raises(InputError, match=message):
             verify_bundle(copied)
 
-    refused("{", "is no bundle's contract")
-    refused("[]", "is no bundle's contract")
+    refused("{", "is not a bundle's contract")
+    refused("[]", "is not a bundle's contract")
     for name in (
         "../model.onnx",
         f"../{copied.name}/model.onnx",
@@ -316,10 +316,10 @@ def test_a_contract_that_is_none_is_refused(copied):
     ):
         refused(json.dumps({**whole, "files": {name: {"sha256": ""}}}), "outside of the bundle")
     refused(json.dumps({**whole, "frames": [{"file": "/etc/hostname"}]}), "but not of its digest")
-    refused(json.dumps({**whole, "files": {}, "frames": []}), "holds no model")
-    refused("[" * 100_000, "is no bundle's contract")
+    refused(json.dumps({**whole, "files": {}, "frames": []}), "contains no model")
+    refused("[" * 100_000, "is not a bundle's contract")
     refused(json.dumps({**whole, "files": {"gone.onnx": {"sha256": ""}}}), "gone.onnx: cannot be read")
-    refused(json.dumps({**whole, "frames": [{"file": "frames/0.png"}]}), "is no bundle's contract")
+    refused(json.dumps({**whole, "frames": [{"file": "frames/0.png"}]}), "is not a bundle's contract")
     path.unlink()
     with pytest.raises(InputError, match="give a bundle's folder"):
         verify_bundle(copied)

@@ -69,7 +69,7 @@ def test_a_scene_is_read_back_as_it_was(scene, tmp_path):
 
 
 def test_kapture_itself_reads_it(scene, tmp_path):
-    """Needs kapture (pip install kapture==1.1.12), which is no extra of this project: it brings numba."""
+    """Needs kapture (pip install kapture==1.1.12), which is not an extra of this project: it brings numba."""
     kapture, reader = pytest.importorskip("kapture"), pytest.importorskip("kapture.io.csv")
     write_kapture(scene, tmp_path / "out")
     rows = {row.image.relative_to(scene).as_posix(): row for row in read_rows(scene)}

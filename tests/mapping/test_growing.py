@@ -219,5 +219,5 @@ def test_pictures_of_another_shape_need_their_camera(part, tmp_path):
 
 
 def test_an_empty_folder_is_refused(part, tmp_path):
-    with pytest.raises(InputError, match=r"holds no image"):
+    with pytest.raises(InputError, match=r"contains no image"):
         read_new_frames(tmp_path, MapLocalizer(part))

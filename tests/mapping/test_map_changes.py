@@ -83,7 +83,7 @@ def test_pictures_are_added_measured_and_removed_again(folder, pictures, den, tm
             ["--remove", "attic", "--out", "{out}"],
             r"attic: is not in the map of room\. Choose one of its sessions: none",
         ),
-        (["--add", "{empty}", "--out", "{out}"], r"holds no image"),
+        (["--add", "{empty}", "--out", "{out}"], r"contains no image"),
         (["--add", "{out}/no.mp4", "--out", "{out}"], r"no such file"),
         (["--remove", "attic", "--out", "{out}", "--name", "attic"], r"--name: is of what --add adds\. Leave it out"),
         (["--intrinsics", "100,100,80,60"], r"--intrinsics: is of what --add adds\. Leave it out"),

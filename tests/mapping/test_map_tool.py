@@ -62,7 +62,7 @@ def test_the_recipe_of_the_blocks_is_read():
         ("scene: a\nroot: 3", "root is '3'. Give text"),
         ("scene: a\nransac_seeds: []", "ransac_seeds is '[]'. Give a list"),
         ("scene: a\nransac_seeds: 0", "ransac_seeds is '0'. Give a list"),
-        ("scene: [", "is no YAML"),
+        ("scene: [", "is not YAML"),
     ],
 )
 def test_a_wrong_recipe_is_refused_in_a_line(tmp_path, text, message, capsys):

@@ -56,7 +56,7 @@ def test_the_data_is_that_of_the_recipe(best, trained):
     assert {name: best.data().hparams[name] for name in recipe} == recipe
     assert best.data(root="/elsewhere").hparams["root"] == "/elsewhere"
     without = replace(best, stored={**best.stored, "datamodule_hyper_parameters": {}})
-    with pytest.raises(InputError, match=r"best\.ckpt: holds no data settings"):
+    with pytest.raises(InputError, match=r"best\.ckpt: contains no data settings"):
         without.data()
 
 

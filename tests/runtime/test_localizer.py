@@ -156,10 +156,10 @@ def test_what_is_no_model(model, tmp_path):
         assert "\n" not in str(error.value)
 
     refused(tmp_path / "nothing.onnx", "no such model")
-    refused(tmp_path, "holds none of model.onnx")
+    refused(tmp_path, "contains none of model.onnx")
     refusal = RuntimeError("Load model failed:\nProtobuf parsing failed.")  # as ONNX Runtime refuses a damaged file
     with mock.patch("onnxruntime.InferenceSession", side_effect=refusal):
-        refused(model, r"ONNX Runtime cannot load it \(Load model failed:\); export it anew")
+        refused(model, r"ONNX Runtime cannot load it \(Load model failed:\); export it again")
     plain = onnx.load(model)
     del plain.metadata_props[:]
     onnx.save(plain, tmp_path / "plain.onnx")
@@ -335,7 +335,7 @@ def test_where_poses_go_is_asked_before_the_work(model, tmp_path):
 def test_what_is_no_source(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "film.mp4").write_bytes(b"no video")
-    for source, message in (("empty", "holds no image"), ("film.mp4", "cannot be opened"), ("none", "no such file")):
+    for source, message in (("empty", "contains no image"), ("film.mp4", "cannot be opened"), ("none", "no such file")):
         with pytest.raises(InputError, match=message):
             frames_of(tmp_path / source)
     for rate_hz in (0, -1, float("nan"), float("inf")):

@@ -287,9 +287,9 @@ def test_training_time_to_an_error_that_is_asked_for(store, tmp_path, monkeypatc
 
 def test_what_cannot_be_reported(store, tmp_path):
     folder, _ = store
-    with pytest.raises(InputError, match="holds no result of the last epoch"):
+    with pytest.raises(InputError, match="contains no result of the last epoch"):
         write_report(tmp_path / "nothing", tmp_path / "report")
-    with pytest.raises(InputError, match="holds no result of the best epoch"):
+    with pytest.raises(InputError, match="contains no result of the best epoch"):
         write_report(folder, tmp_path / "report", epoch="best")
     with pytest.raises(InputError, match="is there already"):
         write_report(folder, folder)

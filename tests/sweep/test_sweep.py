@@ -257,7 +257,7 @@ def test_two_processes_do_not_run_into_one_folder(folder):
 def test_a_store_that_is_none(folder):
     (folder / "out").mkdir()
     (folder / "out/results.sqlite").write_text("no database, but some text that is long enough to be read as a header")
-    with pytest.raises(InputError, match="is no store of results"):
+    with pytest.raises(InputError, match="is not a store of results"):
         run_sweep(six(folder), folder / "out")
     (folder / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):

@@ -57,7 +57,7 @@ def test_scenes_are_loaded_whole(scenes, cache, capsys, monkeypatch):
 
 
 def test_wrong_scenes(tmp_path):
-    with pytest.raises(InputError, match="holds none of chess"):
+    with pytest.raises(InputError, match="contains none of chess"):
         measure_scenes("7scenes", tmp_path, [])
     with pytest.raises(InputError, match="--dataset nowhere"):
         measure_scenes("nowhere", tmp_path, [])

@@ -78,5 +78,5 @@ def test_evidence_of_a_room():
 
 
 def test_a_folder_without_evidence_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"holds no evidence\.npz"):
+    with pytest.raises(InputError, match=r"contains no evidence\.npz"):
         calibrate([tmp_path])

@@ -112,7 +112,7 @@ def test_one_checkpoint_and_no_other_place(systems, tmp_path, capsys):
     print_certainty(found, "a machine")
     assert "another place" not in capsys.readouterr().out
     (tmp_path / "none").mkdir()
-    with pytest.raises(InputError, match=r"--elsewhere .*none: holds no \.png"):
+    with pytest.raises(InputError, match=r"--elsewhere .*none: contains no \.png"):
         measure_certainty({"a": systems[0]}, tmp_path / "none")
 
 

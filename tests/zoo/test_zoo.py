@@ -184,7 +184,7 @@ def test_a_pickle_in_place_of_weights_is_not_opened(copy):
         (lambda m: m["results"][0].pop("commit"), "result 1 lacks commit; nothing is told without"),
         (lambda m: m["results"][0].update(seconds=None), "result 1 lacks seconds"),
         (lambda m: m["results"][0].update(n="many"), "n is 'many'"),
-        (lambda m: m.update(results=["0.1 m"]), "result 1 is no mapping"),
+        (lambda m: m.update(results=["0.1 m"]), "result 1 is not a mapping"),
         (lambda m: m.pop("licence"), "lacks licence"),
         (lambda m: m.update(extra=1), "has extra"),
         (lambda m: m.update(manifest=2), "no manifest of version 1"),

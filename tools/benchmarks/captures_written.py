@@ -1,4 +1,4 @@
-"""Captures in formats that the importer reads, written by NumPy and SciPy alone, with what is true of them.
+"""Captures in formats that the importer reads, written by NumPy and SciPy alone, with their ground truth.
 
 What is drawn with each: names and their order, clocks and their units, the encoding of texts, an origin as in UTM,
 frames without a fix, orientation tags, sizes of images. A pose means the pixels that a file stores.

@@ -83,7 +83,7 @@ def _import(checkout: Path, source: Path, out: Path) -> Cost:
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise InputError(f"{checkout}: its import of {source.name} ended with code {process.returncode}. Mend it.")
+        raise InputError(f"{checkout}: its import of {source.name} ended with code {process.returncode}. Repair it.")
     return usage.ru_utime + usage.ru_stime, time.perf_counter() - start, usage.ru_maxrss / _MIB_KIB
 
 

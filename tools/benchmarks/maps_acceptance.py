@@ -199,7 +199,7 @@ def _read(folders: Sequence[Path]) -> tuple[dict[str, Floats], NDArray[np.int64]
     tables = []
     for folder in folders:
         if not (folder / EVIDENCE_FILE).is_file():
-            raise InputError(f"{folder}: holds no {EVIDENCE_FILE}. Write it with maps.py acceptance.")
+            raise InputError(f"{folder}: contains no {EVIDENCE_FILE}. Write it with maps.py acceptance.")
         tables.append(np.load(folder / EVIDENCE_FILE, allow_pickle=False)["rows"])
     scene = np.repeat(np.arange(len(tables)), [len(each) for each in tables])
     return dict(zip(_FIELDS, np.concatenate(tables).T, strict=True)), scene

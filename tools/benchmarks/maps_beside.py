@@ -126,7 +126,7 @@ def _score(pose: NDArray[Any] | None, cpu_s: float, truth: Floats) -> tuple[floa
 
 
 def errors_of_pose(pose: NDArray[Any] | None, truth: Floats) -> tuple[float, float]:
-    """Metres and degrees between two poses ``world_from_cam`` (4, 4); infinite where there is none."""
+    """Metres and degrees between two poses ``world_from_cam`` (4, 4); infinite without one."""
     if pose is None:
         return np.inf, np.inf
     position_m, rotation_deg, *_ = score(_Found(pose[:3, 3], quaternion_from_matrix(pose[:3, :3])), False, 0.0, truth)

@@ -204,7 +204,7 @@ def _codebook(descriptors: NDArray[np.uint8], seed: int) -> Floats:
 
 
 def _vlad(descriptors: NDArray[np.uint8], words: Floats) -> Floats:
-    """Residuals to the nearest word, summed by word, each sum and then all of them made unit long; (words * 128,)."""
+    """Residuals to the nearest word, summed by word, each sum and then the vector made unit long; (words * 128,)."""
     data = descriptors.astype(np.float32)
     nearest = (data @ words.T - (words**2).sum(axis=1) / 2).argmax(axis=1)
     sums = np.zeros_like(words)

@@ -24,7 +24,7 @@ from mambaloc.viz.trajectory import write_png
 RESULT_FILE = "robustness.json"
 
 _WAYS = {"network": (COLORS[2], "s"), "map": (COLORS[1], "o"), "both": ("#111827", "|")}
-"""Colours that every kind of colour vision tells apart, and a mark of its own for each."""
+"""Colours that every kind of colour vision distinguishes, and a mark of its own for each."""
 
 _COLUMNS = (
     "", "by", "median", "mean", "worst", f"above {FAR_M} m", f"above {FAR_DEG:.0f}°", "accepted",

@@ -140,7 +140,7 @@ def _timed(work: Callable[..., T], *args: Any) -> tuple[T, float]:
 
 
 class Found(Protocol):
-    """A pose ``world_from_cam``, NaN where there is none."""
+    """A pose ``world_from_cam``, NaN without one."""
 
     @property
     def position_m(self) -> NDArray[Any]:

@@ -32,7 +32,7 @@ class SceneCost:
     Args:
         scene: its name.
         listed: frames that its split files list, by split.
-        official: those of the benchmark of that name, train and test; None where there is none.
+        official: those of the benchmark of that name, train and test; None without a benchmark.
         rendered: whether our renderer made it.
         skipped: bad frames.
         read_s: reading splits and poses.
@@ -89,10 +89,10 @@ def measure_scenes(dataset: str, root: Path, scenes: Sequence[str], short_side: 
         InputError: where a scene is not there, or none is.
     """
     if dataset not in DATASETS:
-        raise InputError(f"--dataset {dataset}: there is none; choose one of {', '.join(DATASETS)}")
+        raise InputError(f"unknown --dataset {dataset}; choose one of {', '.join(DATASETS)}")
     names = list(scenes) or [name for name in DATASETS[dataset].official_counts if (root / name).is_dir()]
     if not names:
-        raise InputError(f"{root}: holds none of {', '.join(DATASETS[dataset].official_counts)}; name the scenes")
+        raise InputError(f"{root}: contains none of {', '.join(DATASETS[dataset].official_counts)}; name the scenes")
     kept = default_cache_dir()  # where the disk is that caches are for
     kept.mkdir(parents=True, exist_ok=True)
     found = []

@@ -45,7 +45,7 @@ class Load:
     Args:
         per_second: requests answered with a pose.
         p50_ms: of the time that a request took.
-        p99_ms: likewise.
+        p99_ms: its 99 % quantile.
         status: how often each status was answered; requests without an answer are not among them.
     """
 

@@ -140,7 +140,7 @@ def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]
     with Console(stderr=True).status(f"training {steps} steps"), log.open("w", encoding="utf-8") as said:
         ended = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, check=False)
     if ended.returncode:
-        last = (log.read_text(encoding="utf-8").strip().splitlines() or ["it said nothing"])[-1]
+        last = (log.read_text(encoding="utf-8").strip().splitlines() or ["it printed nothing"])[-1]
         raise InputError(f"{recipes[0]}: its training ended with {ended.returncode} ({last}); see {log}")
     return read_samples(samples)
 

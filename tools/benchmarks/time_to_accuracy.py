@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("sweep", type=Path, help="of trainings, as recipes/sweeps/ holds them")
     parser.add_argument("--map", type=Path, help="recipe of a map, to measure beside pycolmap's route")
     parser.add_argument("--frames", type=whole_number(2), help="key frames of the map; the recipe's unless given")
-    parser.add_argument("--width", type=whole_number(32), help="of its images, in pixels; likewise")
+    parser.add_argument("--width", type=whole_number(32), help="of its images, in pixels; the recipe's unless given")
     parser.add_argument("--reach", type=errors_sought, nargs="+", default=REACH, metavar="M/DEG", help="errors sought")
     parser.add_argument("--out", type=Path, default=Path("runs/time_to_accuracy"), help="folder to write")
     args = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Compare ways of telling how sure a pose is, on the test frames of trained systems of one scene.
+"""Compare estimates of a pose's uncertainty on the test frames of trained systems of one scene.
 
 python tools/benchmarks/uncertainty.py CHECKPOINT ... [--elsewhere FOLDER] [--out FOLDER]
 """

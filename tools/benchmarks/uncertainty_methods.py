@@ -1,4 +1,4 @@
-"""How well a system knows its own errors, by several ways of telling: :mod:`mambaloc.uncertainty` was chosen by it."""
+"""How well a system knows its own errors, by several estimates: :mod:`mambaloc.uncertainty` was chosen by it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ Pictures = Callable[[], Iterator[Frames]]
 
 @dataclass(frozen=True)
 class Way:
-    """A way of telling how sure a pose is: larger scores for what should be wrong by more.
+    """An estimate of a pose's uncertainty: larger scores for what should be wrong by more.
 
     Shape:
         ``position`` and ``rotation`` (N,) over the test frames, ``elsewhere`` (M,) over images of another place, none
@@ -72,16 +72,16 @@ class Certainty:
     """What was found of one system.
 
     Args:
-        name: of the system whose errors are told.
+        name: of the system whose errors are reported.
         where: which system, on which scene.
         held_out_frames: that its radii were measured on.
         position_error_m: of each test frame, (N,).
-        rotation_error_deg: likewise.
+        rotation_error_deg: of each test frame, (N,).
         coverage: shares of test frames within both radii, for each of :data:`LEVELS`.
-        radii: medians of both radii over the test frames, likewise.
+        radii: medians of both radii over the test frames, for each of :data:`LEVELS`.
         unfamiliarity: of the test frames, (N,).
         unfamiliarity_elsewhere: of images of another place, (M,); none where none were given.
-        ways: of telling; the first is the exported one.
+        ways: the estimates; the first is the exported one.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Certainty:
 def measure_certainty(
     systems: Mapping[str, tuple[LitPoseRegressor, PoseDataModule]], elsewhere: Path | None = None
 ) -> list[Certainty]:
-    """Compare ways of telling how sure a pose is, on the test frames of trained systems.
+    """Compare estimates of a pose's uncertainty on the test frames of trained systems.
 
     Args:
         systems: by name, each with the data that it was trained with, all of one scene; several are also taken for an
@@ -172,7 +172,7 @@ def told_apart(score: Tensor, elsewhere: Tensor) -> float:
     of_elsewhere = torch.cat((torch.zeros(len(score)), torch.ones(len(elsewhere))))
     ranks = (
         torch.cat((score, elsewhere)).unique(return_inverse=True)[1].double()
-    )  # what is no probability would be squashed to one
+    )  # what is not a probability would be squashed to one
     return binary_auroc(ranks / ranks.max().clamp_min(1), of_elsewhere.long()).item()
 
 
@@ -210,7 +210,7 @@ def _localized(
 
 @torch.inference_mode()
 def _disagreement(network: PoseNetwork, size: tuple[int, int], pictures: Pictures) -> tuple[Tensor, Tensor]:
-    """How far a dense head's cells are from the pose solved of them, in metres and degrees; (N,) each."""
+    """How far a dense head's cells are from the pose that they are solved for, in metres and degrees; (N,) each."""
     position, rotation = [torch.zeros(0)], [torch.zeros(0)]
     for frames in pictures():
         prediction = _localized(network, frames, size)
@@ -275,7 +275,7 @@ def _pictures_of(folder: Path, data: PoseDataModule) -> Pictures:
     """Images of another place, their middle cut to the shape of the scene's frames."""
     paths = list_images(folder)
     if not paths:
-        raise InputError(f"--elsewhere {folder}: holds no {', '.join(IMAGE_SUFFIXES)}; give a folder of images")
+        raise InputError(f"--elsewhere {folder}: contains no {', '.join(IMAGE_SUFFIXES)}; give a folder of images")
     height, width = next(_test_frames(data)())[0].shape[-2:]
 
     def read() -> Iterator[Frames]:

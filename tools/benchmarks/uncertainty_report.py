@@ -36,8 +36,8 @@ _ERRORS = ("position", "rotation")
 def print_certainty(found: Sequence[Certainty], machine: str) -> None:
     """Print how the ways compare, and what the radii hold; means over the checkpoints."""
     console = Console(highlight=False)
-    columns = ("passes", "rank m", "rank °", "median m", "median °", "told apart")
-    table = new_table("How sure a pose is", "told by", *columns)
+    columns = ("passes", "rank m", "rank °", "median m", "median °", "out of place")
+    table = new_table("How sure a pose is", "estimate", *columns)
     for name, figures in compared(found).items():
         ranks = (f"{figures[f'{of}_rank_correlation']:.2f}" for of in _ERRORS)
         changes = (f"{figures[f'{of}_change']:+.1%}" for of in _ERRORS)
@@ -46,7 +46,7 @@ def print_certainty(found: Sequence[Certainty], machine: str) -> None:
     console.print(table)
     explained = "rank: correlation of scores' ranks with errors'"
     rejected = f"median: what leaving out the {REJECTED:.0%} least sure frames changes it by"
-    console.print(f"{explained}; {rejected}; told apart: area under the ROC curve", soft_wrap=True)
+    console.print(f"{explained}; {rejected}; out of place: area under the ROC curve", soft_wrap=True)
     table = new_table("Test frames within the radii", "asked", "position", "rotation", "radius m", "°")
     for level in LEVELS:
         shares = np.mean([each.coverage[level] for each in found], axis=0)

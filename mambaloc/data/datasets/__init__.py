@@ -1,1 +1,1 @@
-"""One file per dataset: how its splits are read; and the registry of them."""
+"""One file per dataset: how its splits are read; and the registry of datasets."""

@@ -1,7 +1,7 @@
 """Imported scenes: anyone's capture as ``mambaloc import`` writes it.
 
 ``SCENE/frames.csv`` has a row a frame, in the order of :data:`COLUMNS`: an image's path in the folder, the camera's
-``world_from_cam``, the split that it is in. ``SCENE/scene.json`` tells of cameras, units and what was decided.
+``world_from_cam``, the split that it is in. ``SCENE/scene.json`` has cameras, units and what was decided.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Row:
 
 
 def scene_note(folder: Path) -> dict[str, Any]:
-    """What a folder's ``scene.json`` says, whatever wrote it; empty where there is none that can be read."""
+    """What a folder's ``scene.json`` says, whatever wrote it; empty if none can be read."""
     try:
         note = read_json(folder / SCENE_FILE, _MEND, _MEND)
     except InputError:
@@ -92,7 +92,7 @@ def read_scene(folder: Path) -> dict[str, Any]:
     """Read ``scene.json``.
 
     Raises:
-        InputError: where it is none, or another version's.
+        InputError: if it is not an imported scene, or of another version.
     """
     path = folder / SCENE_FILE
     told = read_json(path, _MEND, _MEND)
@@ -107,7 +107,7 @@ def read_rows(folder: Path) -> list[Row]:
     """Read ``frames.csv``.
 
     Raises:
-        InputError: for a row that is none, by its line.
+        InputError: for an invalid row, with its line number.
     """
     path = folder / FRAMES_FILE
     rows: list[Row] = []
@@ -138,7 +138,7 @@ def world_of(folder: Path) -> World:
 
 
 def describe_capture(folder: Path) -> dict[str, Any]:
-    """What an imported scene says of itself that a result must tell: its unit, where it is from, its world,
+    """What a result must state of an imported scene: its unit, its source, its world,
     how it was split."""
     told = read_scene(folder)
     imported, split = (value if isinstance(value := told.get(key), dict) else {} for key in ("imported", "split"))
@@ -174,15 +174,15 @@ def _table(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {_MEND}") from None
     except (csv.Error, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: is no CSV ({error}); {_MEND}") from None
+        raise InputError(f"{path}: is not CSV ({error}); {_MEND}") from None
 
 
 def _row(folder: Path, told: dict[str, str], where: str) -> Row:
     image = path_inside(folder, told["image"])
     if image is None:
-        raise InputError(f"{where}: image {told['image'][:80]!r} is no path inside of the folder; correct the row")
+        raise InputError(f"{where}: image {told['image'][:80]!r} is not a path inside the folder; correct the row")
     if told["split"] not in SPLITS:
-        raise InputError(f"{where}: split {told['split'][:20]!r} is none of {', '.join(SPLITS)}; correct the row")
+        raise InputError(f"{where}: split {told['split'][:20]!r} is not one of {', '.join(SPLITS)}; correct the row")
     if not told["sequence"]:
         raise InputError(f"{where}: names no sequence; correct the row")
     numbers = ("x", "y", "z", "qw", "qx", "qy", "qz", *(["time_s"] if told["time_s"] else []))

@@ -43,7 +43,7 @@ class Source:
         """The folder that holds the scenes unless the user names another."""
         return Path("data") / self.name
 
-    def lacks(self, folder: Path) -> str | None:
+    def missing(self, folder: Path) -> str | None:
         """The first split file or sequence that ``folder`` needs to be a whole scene and does not have.
 
         Raises:
@@ -62,7 +62,7 @@ class Source:
             InputError: for an unknown scene, with the nearest name.
         """
         if scene not in self.archives:
-            raise InputError(f"{scene!r} is no scene of {self.title}. {suggestion(scene, [*self.archives, 'all'])}")
+            raise InputError(f"{scene!r} is not a scene of {self.title}. {suggestion(scene, [*self.archives, 'all'])}")
         return self.archives[scene]
 
     def how_to_get(self, scene: str, root: Path) -> str:

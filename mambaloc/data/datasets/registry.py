@@ -76,7 +76,7 @@ def how_to_get(dataset: str, scene: str, root: Path) -> str:
     if path is None:
         return find_source(dataset).how_to_get(scene, root)
     source, out = (path, Path("scenes", path.name)) if path.is_dir() else ("CAPTURE", path)
-    return f"{path}: is no imported scene; make one with: mambaloc import {source} --out {out}"
+    return f"{path}: is not an imported scene; make one with: mambaloc import {source} --out {out}"
 
 
 def is_rendered(folder: Path) -> bool:
@@ -99,7 +99,7 @@ def find_source(dataset: str) -> Source:
         InputError: for one without a known address, with the nearest name.
     """
     if dataset not in SOURCES:
-        raise InputError(f"{dataset!r} is no dataset with a known address. {suggestion(dataset, SOURCES)}")
+        raise InputError(f"{dataset!r} is not a dataset with a known address. {suggestion(dataset, SOURCES)}")
     return SOURCES[dataset]
 
 
@@ -117,7 +117,7 @@ def describe_sources() -> str:
     for source in SOURCES.values():
         lines += [f"{source.name}: {source.title}, {source.licence} ({source.terms})", f"  {source.page}"]
         for scene, archive in source.archives.items():
-            size = f"{archive.size_bytes / 1e9:.1f} GB" if archive.size_bytes else "size told by the server"
+            size = f"{archive.size_bytes / 1e9:.1f} GB" if archive.size_bytes else "size known to the server"
             lines.append(f"  {scene:<14} {size}")
     return "\n".join(lines)
 

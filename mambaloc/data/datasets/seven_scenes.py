@@ -55,7 +55,9 @@ def read_split(folder: Path, split: Split, bad: BadFrames) -> Frames:
             sequences.append(sequence.name)
             matrices.append(matrix)
     if not paths:
-        raise InputError(f"{folder / _SPLIT_FILES[split]}: its sequences hold no usable frame")
+        raise InputError(
+            f"{folder / _SPLIT_FILES[split]}: its sequences have no usable frame. Check the sequence folders."
+        )
     world_from_cam = np.stack(matrices)
     quaternion = quaternion_from_matrix(world_from_cam[:, :3, :3])
     return Frames(tuple(paths), tuple(sequences), world_from_cam[:, :3, 3].copy(), quaternion)
@@ -74,7 +76,7 @@ def _listed_sequences(split_file: Path) -> list[int]:
             continue
         match = re.fullmatch(r"\s*sequence\s*(\d{1,6})\s*", line, re.IGNORECASE)
         if not match:
-            raise InputError(f"{split_file}, line {row}: {line.strip()[:40]!r} is no 'sequenceN'; correct the line")
+            raise InputError(f"{split_file}, line {row}: {line.strip()[:40]!r} is not a 'sequenceN'; correct the line")
         if int(match[1]) in numbers:
             raise InputError(f"{split_file}, line {row}: lists sequence{int(match[1])} again; remove the line")
         numbers[int(match[1])] = None

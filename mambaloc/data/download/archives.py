@@ -38,7 +38,7 @@ def unpack(
         archive: the zip file.
         folder: an existing folder.
         limit_bytes: the most that may be written, inner zips included.
-        on_bytes: told of every chunk written.
+        on_bytes: called with the size of every chunk written.
 
     Raises:
         InputError: not a zip, damaged or encrypted; a member that leaves the folder, is a link or a device, or is
@@ -70,7 +70,7 @@ def _unpack(
 def _judge(
     opened: zipfile.ZipFile, name: str, limit_bytes: int, depth: int
 ) -> list[tuple[zipfile.ZipInfo, PurePosixPath]]:
-    """The members to write, with their paths, once all of them are found to be harmless."""
+    """The members to write, with their paths, once every member is found to be harmless."""
     members = []
     for info in opened.infolist():
         if not info.filename:

@@ -1,4 +1,4 @@
-"""Fetch one large file over HTTP: resumed where it broke off, started anew where the server's file changed."""
+"""Fetch one large file over HTTP: resumed where it broke off, started again where the server's file changed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LONGEST_PAUSE_S = 30.0
 
 
 class UnreachableError(Exception):
-    """No address gave the file; the message says what each of them answered."""
+    """No address gave the file; the message has each server's answer."""
 
 
 class _DroppedError(Exception):
@@ -48,15 +48,15 @@ def fetch(
 ) -> Offer:
     """Fetch ``target`` from the first of ``urls`` that has it.
 
-    Until it is whole the file is ``<target>.part``, with ``<target>.part.json`` to tell which version it is of:
+    Until it is whole the file is ``<target>.part``, with ``<target>.part.json``, which records its version:
     killed or cut off, it continues there at the next call.
 
     Args:
         urls: addresses of the same file, tried in order.
         target: the file to write.
-        on_offer: told the file's size (None where the server is silent) and the byte where this transfer starts,
+        on_offer: called with the file's size (None where the server is silent) and the byte where this transfer starts,
             before the first byte is taken; it may raise to decline.
-        on_bytes: told the size of every chunk.
+        on_bytes: called with the size of every chunk.
         tries: attempts in a row that bring no new byte, before an address is given up.
         pause_s: the wait before a retry, doubled each time.
 
@@ -120,7 +120,7 @@ class _Transfer:
         return offer
 
     def _kept(self) -> Offer | None:
-        """The version that the unfinished file is of, None where there is no such file or no telling."""
+        """The version that the unfinished file is of, None without such a file or a known version."""
         try:
             kept = Offer(**json.loads(self.state.read_text()))
         except (OSError, ValueError, TypeError):
@@ -128,7 +128,7 @@ class _Transfer:
         return kept if kept.url == self.url and self.have else None
 
     def _ask(self, kept: Offer | None) -> HTTPResponse:
-        """Open the address; ask for the rest alone where the server can tell whether it is of the same version."""
+        """Open the address; ask for the rest alone where the server can compare versions."""
         headers = {"User-Agent": "mambaloc-download", "Accept-Encoding": "identity"}
         if kept is not None and kept.tag is not None:
             headers |= {"Range": f"bytes={self.have}-", "If-Range": kept.tag}

@@ -90,9 +90,11 @@ def _get(source: Source, scene: str, root: Path, keep_archive: bool, accept_chan
 def _is_complete(source: Source, target: Path) -> bool:
     if not target.is_dir() or not any(target.iterdir()):
         return False
-    lacking = source.lacks(target)
-    if lacking is not None:
-        raise InputError(f"{target} is there but lacks {lacking}: move the folder away and run this again")
+    missing = source.missing(target)
+    if missing is not None:
+        raise InputError(
+            f"{target}: the folder exists, but {missing} is missing. Move the folder away and run this again."
+        )
     return True
 
 
@@ -181,7 +183,7 @@ def _scene_in(folder: Path, source: Source, archive: Path) -> Path:
     for candidate in (folder, *(path for path in folder.iterdir() if path.is_dir())):
         if all((candidate / split).is_file() for split in source.splits):
             return candidate
-    raise InputError(f"{archive} holds no {' and '.join(source.splits)}: it is not a scene of {source.title}")
+    raise InputError(f"{archive}: contains no {' and '.join(source.splits)}, so it is not a scene of {source.title}")
 
 
 @contextmanager

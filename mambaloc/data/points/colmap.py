@@ -25,13 +25,13 @@ def read_colmap_points(folder: Path, frames: Frames, count: int, seed: int) -> S
     """Draw, of each frame, points that its image observes; the arguments of ``read_depth_points``.
 
     Raises:
-        InputError: without pycolmap, or for a model that it cannot read, that holds none of the frames, or holds them
+        InputError: without pycolmap, or for a model that it cannot read, that has none of the frames, or has them
             in other poses.
     """
     path = colmap_folder(folder)
     if path is None:
         raise InputError(
-            f"{folder / COLMAP_FOLDERS[0]}: holds no COLMAP model; put its cameras, images, points3D there"
+            f"{folder / COLMAP_FOLDERS[0]}: contains no COLMAP model; put its cameras, images, points3D there"
         )
     rows = frames.rows_by_name(folder)
     model = load_colmap(path)

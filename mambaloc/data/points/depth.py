@@ -91,7 +91,7 @@ def read_depth_mm(path: Path) -> NDArray[np.uint16]:
     """
     depth_mm = read_whole_png(path)
     if depth_mm is None or depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
-        raise InputError(f"{path}: is no whole 16-bit PNG of one channel; mend it, or remove it to do without it")
+        raise InputError(f"{path}: is not a complete 16-bit PNG of one channel. Repair or remove it.")
     return depth_mm
 
 
@@ -117,7 +117,7 @@ def read_depth_intrinsics(folder: Path, size: tuple[int, int]) -> NDArray[np.flo
         matrix = np.empty(0)
     is_pinhole = matrix.shape == (3, 3) and np.isfinite(matrix).all() and np.allclose(matrix[2], (0, 0, 1))
     if not is_pinhole or min(matrix[0, 0], matrix[1, 1]) <= 0 or matrix[1, 0] != 0:
-        raise InputError(f"{path}: is no pinhole matrix 'fx 0 cx, 0 fy cy, 0 0 1' in pixels; correct or remove it")
+        raise InputError(f"{path}: is not a pinhole matrix 'fx 0 cx, 0 fy cy, 0 0 1' in pixels; correct or remove it")
     return matrix
 
 

@@ -17,7 +17,7 @@ def read_nvm_points(folder: Path, frames: Frames, count: int, seed: int) -> Scen
     """Draw, of each frame, points whose track lists its image; the arguments of ``read_depth_points``.
 
     Raises:
-        InputError: for a file that is malformed, holds none of the frames, or holds them in other poses.
+        InputError: for a file that is malformed, has none of the frames, or has them in other poses.
     """
     path, rows = folder / NVM_FILE, frames.rows_by_name(folder)
     cameras, seen = read_nvm(path, set(rows))

@@ -21,7 +21,7 @@ def read_points(folder: Path, frames: Frames, cameras: Cameras, count: int, seed
 
     Args:
         folder: the scene's.
-        frames: the frames asked for, N of them with readable images.
+        frames: the N frames asked for, with readable images.
         cameras: of these.
         count: points a frame, P; where there are more, a draw that depends on the seed and the frame's name alone.
         seed: of the draw.
@@ -44,11 +44,11 @@ def read_points(folder: Path, frames: Frames, cameras: Cameras, count: int, seed
         raise InputError(
             f"{folder}: has no scene points for data.points_per_frame: no depth frame such as "
             f"{depth_path(frames.image_paths[0]).relative_to(folder)}, no {NVM_FILE}, no COLMAP model in "
-            f"{' or '.join(COLMAP_FOLDERS)}; add one of them, or set data.points_per_frame to 0"
+            f"{' or '.join(COLMAP_FOLDERS)}; add such a file, or set data.points_per_frame to 0"
         )
     if not points.per_frame().any():
         raise InputError(
-            f"{folder}: its {points.source} holds no point for any of {len(frames)} frames; "
-            "mend it, or choose a model that needs no points"
+            f"{folder}: its {points.source} contains no point for any of {len(frames)} frames; "
+            "repair it, or choose a model that needs no points"
         )
     return points

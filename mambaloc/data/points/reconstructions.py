@@ -21,7 +21,7 @@ TOLERANCE_DEG = 1.0
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The M cameras of a model that are among the frames asked for, and the points each of them sees.
+    """The M cameras of a model that are among the frames asked for, and the points that each sees.
 
     Shape:
         ``rows`` (M,), each camera's row among the frames; ``position_m`` (M, 3) and ``quaternion`` (M, 4), its
@@ -44,7 +44,7 @@ def points_of_frames(
     """
     if not len(model.rows):
         raise InputError(
-            f"{file}: holds none of {len(frames)} frames, such as {frames.image_paths[0]}; "
+            f"{file}: contains none of {len(frames)} frames, such as {frames.image_paths[0]}; "
             "name the model's images by their path in the scene's folder"
         )
     agrees = _agrees(model, file, frames)

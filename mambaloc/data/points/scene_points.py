@@ -1,4 +1,4 @@
-"""The record that every reader of scene points returns, and the seeded choice among too many of them."""
+"""The record that every reader of scene points returns, and the seeded choice among too many points."""
 
 from __future__ import annotations
 

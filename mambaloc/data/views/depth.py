@@ -66,7 +66,7 @@ def depth_of_frames(folder: Path, data: CachedFrames, how: ViewDepth, device: to
         device: that searches depth in images.
 
     Raises:
-        InputError: where there is none that fits the poses.
+        InputError: if no depth fits the poses.
     """
     rows = [] if how == "pictures" else depth_rows(data.frames)
     if how == "sensor":
@@ -99,7 +99,7 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
         InputError: where no depth can be used, or most of it disagrees with the poses.
     """
     if not rows:
-        raise InputError(f"{folder}: no training frame has depth. Set data.view_depth to images.")
+        raise InputError(f"{folder}: no training frame has depth. Set data.view_depth to pictures.")
     poses = poses_of(data.frames.select(np.array(rows)))
     chosen = np.array(rows)[farthest_points(viewpoints(poses, spread_m(poses)), _MOST_FRAMES, first=0)]
     files = [depth_path(data.frames.image_paths[row]) for row in chosen]
@@ -108,7 +108,7 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
     rules = {file: each for file, each in zip(files, read, strict=True) if isinstance(each, str)}
     if len(rules) == len(files):
         line = f"{files[0]}: depth {rules[files[0]]}, and no other depth frame can be used."
-        raise InputError(f"{line} Mend them, or set data.view_depth to images.")
+        raise InputError(f"{line} Repair them, or set data.view_depth to pictures.")
     known = {file: each for file, each in zip(files, read, strict=True) if not isinstance(each, str)}
     rules |= of_another_unit(known)
     kept = [row for row, file in enumerate(files) if file not in rules]
@@ -133,7 +133,7 @@ def read_all(
         try:
             depth_mm = read_depth_mm(file)
         except InputError:
-            return "is no whole 16-bit PNG of one channel"
+            return "is not a complete 16-bit PNG of one channel"
         if depth_mm.shape != sensor_size[::-1]:
             return f"is not {sensor_size[0]}x{sensor_size[1]} as most depth frames are"
         is_unknown = np.isin(depth_mm, NO_DEPTH_MM)

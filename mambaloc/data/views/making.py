@@ -89,7 +89,7 @@ class SceneViews:
         )
 
     def describe(self) -> dict[str, Any]:
-        """What a result says of them."""
+        """Describe the views for a result."""
         return {
             "count": 0 if self.views is None else len(self.views),
             "depth": self.kind,

@@ -26,7 +26,7 @@ class FramesAndViews(CachedFrames):
 
     Args:
         real: the frames, each an item of its own.
-        views: V of them.
+        views: V views.
         share: of views in a batch, more than 0 and less than 1.
         points: what each view shows, if the frames carry points.
     """

@@ -130,8 +130,8 @@ def check_agreement(found: Agreement) -> list[Finding]:
     if not found.is_known:
         said = f"not compared: {found.matches} matches on {found.pairs} pairs of images"
         concern = (
-            f"nothing could be compared: {found.matches} matches between images are too few to tell whether the poses "
-            "are theirs; look at trajectory.png, and give larger or more textured images if you can"
+            f"nothing could be compared: {found.matches} matches between images are too few to check whether the poses "
+            "fit; look at trajectory.png, and give larger or more textured images if you can"
         )
         return [Finding(name, said, concern, figures=figures)]
     others = max(share for convention, share in found.share.items() if convention != AS_READ)
@@ -167,7 +167,7 @@ def _contradiction(found: Agreement) -> str:
         )
     if found.is_guessed and max(share, float(found.focal_share.max())) < _AGREE:
         return (
-            f"only {share:.0%} of matches between images agree with the poses, and no focal length makes more of them "
+            f"only {share:.0%} of matches between images agree with the poses, and no focal length makes more agree "
             "agree than chance: the poses may be inaccurate, of other images, or meant otherwise than they were read; "
             "compare choices with how the file was written"
         )

@@ -1,4 +1,4 @@
-"""Which way a capture's world and cameras are turned: measured, and told with how sure it is."""
+"""Which way a capture's world and cameras are turned: measured, with how sure it is."""
 
 from __future__ import annotations
 

@@ -136,7 +136,8 @@ def _confidence(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     found = read_whole_png(path)
     if found is None or found.dtype != np.uint8 or found.shape != shape:
         raise InputError(
-            f"{path}: is no whole 8-bit PNG of one channel and the size of its depth frame, {shape[1]}x{shape[0]}. "
+            f"{path}: is not a complete 8-bit PNG of one channel and the size of its depth frame, "
+            f"{shape[1]}x{shape[0]}. "
             "Copy the recording again, or remove the file to trust all of that frame's depth."
         )
     return found

@@ -138,7 +138,7 @@ def _round_edges(values: Floats) -> list[float]:
 
 
 def _fitted(matches: Matches, pair: int) -> int:
-    """How many matches of a pair agree with the pose that most of them agree with."""
+    """How many matches of a pair agree with the pose that most agree with."""
     rows = slice(*np.searchsorted(matches.pair, (pair, pair + 1)))
     near = NEAR_PX / matches.focal_px[pair]
     first, second = matches.first[rows], matches.second[rows]

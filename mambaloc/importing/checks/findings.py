@@ -13,7 +13,7 @@ class Finding:
 
     Args:
         name: what.
-        said: what was found, in a line.
+        said: the result, in a line.
         concern: why care is needed, in a line; empty where none is.
         is_fatal: nothing can be trained because of it.
         figures: what was measured.

@@ -1,7 +1,7 @@
 """Frames without a fix: poses that a logger or a tracker writes where it has none, and poses far off from all others.
 
 NaN, infinity and rows of zeros are found by the readers. A position of exactly 0 0 0 may be a mark, or where a world
-begins; the frames around it tell.
+begins; the frames around it decide.
 """
 
 from __future__ import annotations

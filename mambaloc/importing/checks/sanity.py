@@ -1,4 +1,4 @@
-"""What is sound about a capture and what is not: each check a line, and a verdict of them all."""
+"""What is sound about a capture and what is not: each check a line, and a verdict of all checks."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _broken(pose: NDArray[np.float64]) -> str:
 
 
 def check_frames(capture: Capture, left_out: Mapping[str, str]) -> Finding:
-    """Say how many frames there are, and what was left out of them; of too few, every cause that is known.
+    """Count frames and those left out; if too few are left, name every known cause.
 
     Args:
         capture: of those that are left.
@@ -208,7 +208,7 @@ def check_extent(capture: Capture, motion: Motion, unit: str) -> Finding:
 def check_times(capture: Capture) -> Finding:
     """Say whether time goes forward within each sequence."""
     if capture.time_s is None:
-        return Finding("time", "not told by the format")
+        return Finding("time", "not in the format")
     names = np.array(capture.sequences)
     steps = np.diff(capture.time_s)[names[1:] == names[:-1]]
     backwards, still = int((steps < 0).sum()), int((steps == 0).sum())

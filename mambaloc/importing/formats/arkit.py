@@ -94,7 +94,7 @@ def is_polycam(source: Path) -> bool:
 
 
 def read_polycam(source: Path) -> Capture:
-    """Read optimised poses with their undistorted images, or ARKit's own where there are none.
+    """Read optimised poses with their undistorted images, or ARKit's own without optimised ones.
 
     Raises:
         InputError: for a file that is missing or damaged.
@@ -189,7 +189,7 @@ def _polycam_frame(path: Path, image: Path) -> tuple[np.ndarray, Camera]:
 
 
 def _polycam_size(frame: dict[str, object], center: Sequence[float], path: Path, image: Path) -> list[float]:
-    """Width and height that a camera is told for: by itself, by the one that was not corrected, or by its image.
+    """Width and height that a camera is given for: its own, those of the uncorrected camera, or its image's.
 
     That of the one that was not corrected counts where the principal point is about its middle: correcting may crop.
     """

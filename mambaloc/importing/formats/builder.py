@@ -100,7 +100,7 @@ def build_capture(
         left_out: why images are left out that the format marks as bad.
         depth_camera: (3, 3), in pixels of depth frames, which are in millimetres.
         split_concern: as of :class:`Capture`.
-        metres_per_unit: likewise.
+        metres_per_unit: as of :class:`Capture`.
 
     Raises:
         InputError: for no image, one with two poses, or more than a scene may have.
@@ -208,7 +208,7 @@ def _faults(
     """The first rule that rows break, with where they are; and which rows have a pose.
 
     Raises:
-        InputError: where all rows that are no marks break one.
+        InputError: where all rows that are not marks break one.
     """
     usable: NDArray[np.bool_] = ~lost
     faults: dict[int, str] = {}
@@ -239,7 +239,7 @@ def pinhole(size: Sequence[float], focal: Sequence[float], center: Sequence[floa
         where: the file, for messages.
 
     Raises:
-        InputError: for a size that is none, or numbers that no lens has.
+        InputError: for an invalid size, or impossible lens parameters.
     """
     width, height = size
     is_size = all(1 <= side <= LARGEST_SIDE_PX and side == int(side) for side in size)

@@ -31,7 +31,7 @@ def calibrated(source: Path, images: Sequence[Path]) -> tuple[dict[Path, Camera]
         images: all there.
 
     Returns:
-        Cameras by image, and nothing to say; or none of them, and why where there are files that do not fit.
+        Cameras by image and an empty message; or no cameras and why, if there are files that do not fit.
 
     Raises:
         InputError: for a file that is malformed, or numbers that no camera has.

@@ -53,7 +53,7 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
     """
     models = colmap_models(source, _ROOTS)
     if not models:
-        raise InputError(f"{source}: holds no COLMAP model; give the folder of cameras, images and points3D")
+        raise InputError(f"{source}: contains no COLMAP model; give the folder of cameras, images and points3D")
     path = models[0]
     model = load_colmap(path)
     placed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: _key(image.name))
@@ -129,7 +129,7 @@ def _said(source: Path, models: list[Path]) -> str:
 
 
 def _find(source: Path, model: Path, images: Path | None, names: list[str]) -> Found:
-    """The images in the folder that is given, or in the first that has most of them."""
+    """The images in the given folder, or in the first folder that has most images."""
     folders = [source / "images", source, *(source / f"images{end}" for end in SMALLER)]
     if source in (model, model.parent):  # a model's own folder, such as sparse/0: images are beside sparse
         root = source.resolve()
@@ -144,7 +144,7 @@ def _find(source: Path, model: Path, images: Path | None, names: list[str]) -> F
 
 
 def _sequence(name: str, source: Path) -> str:
-    """The folder that an image's name tells, as recordings are kept apart; else the source's own."""
+    """The folder in an image's name, as recordings are kept apart; else the source's own."""
     parent = Path(name.replace("\\", "/")).parent.as_posix()
     return folder_name(source) if parent == "." else parent
 

@@ -83,7 +83,7 @@ def metres_per_unit(columns: Sequence[Column], where: str) -> float | None:
         where: their line, for messages.
 
     Raises:
-        InputError: for a unit that is no length, or several.
+        InputError: for a unit that is not a length, or several.
     """
     units = {column.unit for column in columns}
     if units <= set(_NO_UNITS):

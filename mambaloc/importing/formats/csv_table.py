@@ -94,7 +94,7 @@ def read_csv(source: Path, direction: Direction | None = None, images: Path | No
         for image, sequence, row, time_s in pictured.frames
     ]
     is_known = columns.position == POSITIONS[2] or (columns.position == POSITIONS[0] and "scene" in rows[0][1])
-    known = "metres, as the datasets have them" if is_known else "unknown: the table does not tell"
+    known = "metres, as the datasets have them" if is_known else "unknown: the table does not state it"
     choices = {
         "axes": "OpenCV camera axes, as the datasets have them",
         "direction": "world-to-camera, as --format says" if direction == "cam_from_world" else "camera-to-world",
@@ -148,7 +148,7 @@ def _rows(path: Path) -> tuple[TableColumns, list[Row]]:
             if values:
                 rows.append((reader.line_num, dict(zip(names, map(str.strip, values), strict=True))))
     except csv.Error as error:
-        raise InputError(f"{path}, line {reader.line_num}: is no CSV ({error}); export it again") from None
+        raise InputError(f"{path}, line {reader.line_num}: is not CSV ({error}); export it again") from None
     if not rows:
         raise InputError(f"{path}: has no row below its columns' names; add them")
     return columns, rows if delimiter == "," else _with_points(rows, columns)
@@ -210,7 +210,7 @@ def _by_image(path: Path, rows: list[Row], columns: TableColumns, given: Path | 
         if stamps is None:
             line, row = next(((line, row) for line, row in rows if stamps_of([row[columns.time]]) is None), rows[0])
             time = row[columns.time][:40]
-            raise InputError(f"{path}, line {line}: time {time!r} is no number of seconds; correct it")
+            raise InputError(f"{path}, line {line}: time {time!r} is not a number of seconds; correct it")
     frames: list[tuple[Path, str, int, float | None]] = []
     for place, ((_, row), image) in enumerate(zip(rows, images, strict=True)):
         if image.is_file():
@@ -244,5 +244,5 @@ def _split(path: Path, line: int, row: dict[str, str]) -> str | None:
     if "split" not in row:
         return None
     if row["split"].lower() not in _SPLITS:
-        raise InputError(f"{path}, line {line}: split {row['split'][:40]!r} is none of train, val, test; correct it")
+        raise InputError(f"{path}, line {line}: split {row['split'][:40]!r} is not one of train, val, test; correct it")
     return _SPLITS[row["split"].lower()]

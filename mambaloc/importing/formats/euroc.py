@@ -78,7 +78,7 @@ def read_euroc(source: Path, images: Path | None = None) -> Capture:
     listed = _rows(listing, "rows timestamp, filename")
     short = next((line for line, row in listed if len(row) < 2 or stamps_of(row[:1]) is None), None)
     if short is not None or not listed:
-        raise InputError(f"{listing}, line {short or 1}: is no row 'timestamp, filename'; correct or remove it")
+        raise InputError(f"{listing}, line {short or 1}: is not a row 'timestamp, filename'; correct or remove it")
     camera, body_from_cam = _camera(folder / "cam0/sensor.yaml")
     found = find_images(images or listing.parent / "data", [(row[1], f"{listing}, line {n}") for n, row in listed])
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
@@ -124,7 +124,7 @@ def _mav0(source: Path) -> Path:
 
 
 def _rows(path: Path, holds: str) -> list[tuple[int, list[str]]]:
-    """Words between commas of each line that is no comment, with its number."""
+    """Words between commas of each line that is not a comment, with its number."""
     lines = enumerate(read_text(path, holds).splitlines(), start=1)
     return [
         (number, [word.strip() for word in line.split(",")])
@@ -147,7 +147,7 @@ def _poses(path: Path) -> Table:
     for at, (line, words) in enumerate(rows):
         values = as_numbers(words[1:8])
         if values is None or len(values) != len(_POSE):
-            raise InputError(f"{path}, line {line}: is no row of a time stamp and 7 numbers; correct or remove it")
+            raise InputError(f"{path}, line {line}: is not a row of a time stamp and 7 numbers; correct or remove it")
         numbers[at] = values
     if not rows:
         raise InputError(f"{path}: has no pose; give a recording with a ground truth")
@@ -158,7 +158,7 @@ def _sensor(path: Path) -> Mapping[str, Any]:
     text = read_text(path, "the calibration of a sensor").removeprefix(_OPENCVS_DIRECTIVE)
     content = parse_yaml(text, path, "give the recording's own")
     if not isinstance(content, Mapping):
-        raise InputError(f"{path}: holds no calibration of a sensor; give the recording's own")
+        raise InputError(f"{path}: contains no calibration of a sensor; give the recording's own")
     return content
 
 
@@ -168,7 +168,7 @@ def _transform(content: Mapping[str, Any], path: Path) -> Matrices:
     matrix = array_of(np.ravel(rows).tolist() if isinstance(rows, list) else rows, (16,), "T_BS", path).reshape(4, 4)
     (pose,) = validate_se3(matrix[None], lambda _: f"{path}: T_BS").poses
     if np.isnan(pose).any():  # a mark of no fix, which no calibration has
-        raise InputError(f"{path}: T_BS is no rotation and shift; give the recording's own")
+        raise InputError(f"{path}: T_BS is not a rotation and translation; give the recording's own")
     return pose
 
 
@@ -194,7 +194,7 @@ def _camera(path: Path) -> tuple[Camera, Matrices]:
         return camera, body_from_cam
     if not isinstance(model, str) or model not in _LENSES:
         raise InputError(
-            f"{path}: distortion_model {str(model)[:40]!r} is none of {', '.join(_LENSES)}; calibrate it so"
+            f"{path}: distortion_model {str(model)[:40]!r} is not one of {', '.join(_LENSES)}; calibrate it so"
         )
     lens, counts = _LENSES[model]
     coefficients = array_of(told, (None,), "distortion_coefficients", path).tolist()

@@ -56,7 +56,7 @@ def find_images(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
 
     An image that is not where its path says is looked for in the folders of smaller copies, as ``images_4`` of
     ``images``, and then by the longest end of its path that a file below the root has. An end of the file's name alone
-    counts only where all paths are of one folder: otherwise the folder may be what tells images apart. An image with
+    counts only where all paths are of one folder: otherwise the folder may be what distinguishes images. An image with
     another suffix counts where its folder is called as the path says, or is the root: elsewhere it may be depth.
 
     Args:
@@ -78,7 +78,7 @@ def find_images(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
     if outside and not any(files[row] for row in outside):
         name, where = named[outside[0]]
         raise InputError(
-            f"{where}: names {name[:60]!r}, which is no file inside of {root}, and no image there has that path's "
+            f"{where}: names {name[:60]!r}, which is not a file inside {root}, and no image there has that path's "
             f"end. {_GIVE}"
         )
     if not any(files):
@@ -113,7 +113,7 @@ def _by_tails(
     for name, where in lost:
         if not isinstance(name, str) or not _is_possible(tails.root, name):
             raise InputError(
-                f"{where}: names {str(name)[:60]!r}, which is no file inside of {tails.root}; write the image's path "
+                f"{where}: names {str(name)[:60]!r}, which is not a file inside {tails.root}; write the image's path "
                 "there"
             )
     least = 1 if len({path_parts(name)[:-1] for name, _ in named}) == 1 else 2
@@ -122,7 +122,7 @@ def _by_tails(
 
 
 def _is_possible(root: Path, name: str) -> bool:
-    """Whether a file may have the name of a path, with a suffix if it lacks one."""
+    """Whether a file may have the name of a path, with a suffix if it has none."""
     longest = "/".join(path_parts(name))
     longest += max(map(len, IMAGE_SUFFIXES)) * "_" if longest and not _has_suffix(longest) else ""
     return path_inside(root, longest) is not None
@@ -152,7 +152,7 @@ def path_parts(name: str) -> Parts:
 
 
 def _there(root: Path, path: Path) -> Path | None:
-    """The image of a path, by itself, with a suffix, or as a smaller copy; None where there is none."""
+    """The image of a path, by itself, with a suffix, or as a smaller copy; None if no file exists."""
     ends = ("", *SMALLER) if path.parent != root else ("",)
     for end in ends:
         parent = path.parent.with_name(path.parent.name + end) if end else path.parent
@@ -163,7 +163,7 @@ def _there(root: Path, path: Path) -> Path | None:
 
 
 def _spelled(name: str) -> Iterator[str]:
-    """An image's name with the suffixes that it may lack."""
+    """An image's name with the suffixes that may be missing."""
     if _has_suffix(name):
         yield name
     else:
@@ -240,7 +240,7 @@ def _common(known: Sequence[str], named: Sequence[str]) -> int:
 
 
 def _largest(paths: list[Parts]) -> list[Parts]:
-    """Of copies in different sizes the largest; all paths where some are no copies of the others."""
+    """Of copies in different sizes the largest; all paths where some are not copies of the others."""
     ends = [next((end for end in SMALLER if path[-2].endswith(end)), "") for path in paths]
     if len({(*path[:-2], path[-2].removesuffix(end)) for path, end in zip(paths, ends, strict=True)}) > 1:
         return paths

@@ -34,7 +34,7 @@ _SINCE_1970_S = (5e8, 5e9)  # from 1985 to 2128: other numbers may be counters
 _CHOICES = {
     "axes": "OpenCV camera axes, as COLMAP has them",
     "direction": "world-to-device in the file, inverted; sensors of a rig by the rig's pose",
-    "scale": "unknown: the format does not tell",
+    "scale": "unknown: the format does not state it",
     "origin": "kept",
 }
 
@@ -71,7 +71,7 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
     """
     parts = _parts(source)
     if not parts:
-        raise InputError(f"{source}: holds no sensors/sensors.txt of kapture; give a folder that does")
+        raise InputError(f"{source}: contains no sensors/sensors.txt of kapture; give a folder that does")
     frames: list[tuple[Key, Posed, tuple[str, ...] | None]] = []
     missing: list[str] = []
     beside: list[Path] = []
@@ -139,7 +139,7 @@ def _rows(path: Path, columns: Sequence[str], may_be_more: bool = False) -> Iter
             continue
         words = [word.strip() for word in text.split(",")]
         if len(words) < len(columns) or (len(words) > len(columns) and not may_be_more):
-            raise InputError(f"{path}, line {line}: is no row {', '.join(columns)}; correct or remove it")
+            raise InputError(f"{path}, line {line}: is not a row {', '.join(columns)}; correct or remove it")
         yield f"{path}, line {line}", words
 
 
@@ -155,7 +155,7 @@ def _transforms(path: Path) -> tuple[list[list[str]], Checked]:
     for where, words in _rows(path, ("key", "device", "qw", "qx", "qy", "qz", "tx", "ty", "tz")):
         values = as_numbers([word or "nan" for word in words[2:]])
         if values is None:
-            raise InputError(f"{where}: is no quaternion and translation; correct or remove it")
+            raise InputError(f"{where}: is not a quaternion and translation; correct or remove it")
         names.append(words[:2])
         numbers.append(values)
         places.append(where)
@@ -184,7 +184,7 @@ def _key(stamp: str, device: str, where: str | Path) -> Key:
     try:
         return int(stamp), device
     except ValueError:
-        raise InputError(f"{where}: time stamp {stamp[:40]!r} is no whole number; correct it") from None
+        raise InputError(f"{where}: time stamp {stamp[:40]!r} is not an integer; correct it") from None
 
 
 def _rigs(path: Path) -> dict[str, list[tuple[str, Matrices]]]:
@@ -219,7 +219,7 @@ def _told(sensors: Mapping[str, tuple[str, ...]], record: _Record) -> tuple[str,
     """Where an image's camera is, its model and its numbers; None for one that is not calibrated."""
     told = sensors.get(record.key[1])
     if told is None:
-        raise InputError(f"{record.where}: sensor {record.key[1][:40]!r} is no camera of sensors.txt; add it there")
+        raise InputError(f"{record.where}: sensor {record.key[1][:40]!r} is not a camera of sensors.txt; add it there")
     return None if told[1:2] == (UNKNOWN,) else told
 
 

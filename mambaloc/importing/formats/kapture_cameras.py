@@ -30,7 +30,7 @@ _COEFFICIENTS = {
 
 
 def told_cameras(lenses: Sequence[tuple[str, ...] | None]) -> tuple[list[str | None], dict[str, Camera]]:
-    """The name of each image's camera, and cameras by name, which are none where an image has none.
+    """The name of each image's camera, and cameras by name; both are empty if an image has no camera.
 
     Args:
         lenses: of each image, where its camera is, its model and its numbers; None for one that is not calibrated.

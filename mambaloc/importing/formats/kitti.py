@@ -4,7 +4,7 @@ A line of ``poses/NN.txt`` is the first three rows of a 4x4 matrix: the pose of 
 the world of the sequence's first frame (camera-to-world, z forward, metres). ``calib.txt`` holds ``P0`` to ``P3``, each
 ``K [I | t]`` of a rectified camera, so that the colour camera 2 is camera 0 moved by ``-t``: six centimetres aside.
 Source: the readme of the odometry benchmark's development kit (Geiger et al. 2012), and pykitti, which moves camera 2
-likewise.
+the same way.
 """
 
 from __future__ import annotations
@@ -93,7 +93,9 @@ def read_kitti_poses(source: Path) -> Capture:
     path = only_file(_bare_files(source), source)
     layout = layout_of(path)
     if layout is not None and (layout.is_named, layout.count) != (False, 12):
-        raise InputError(f"{path}: does not have lines {_ROW!r}. Leave --format out, and its lines tell what it is.")
+        raise InputError(
+            f"{path}: does not have lines {_ROW!r}. Omit --format: the format is found by the file's lines."
+        )
     return read_in_order(path, layout or Layout(False, False, 12), "kitti_poses", _CHOICES)
 
 
@@ -126,7 +128,7 @@ def _camera(calibration: Path, name: str, image: Path) -> tuple[Camera, Matrices
     projection = values.reshape(3, 4)
     matrix = projection[:, :3]
     if not np.array_equal(matrix[2], (0, 0, 1)) or matrix[1, 0] != 0 or min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise InputError(f"{calibration}: '{key}' is no projection K [I | t] of a rectified camera; get it again")
+        raise InputError(f"{calibration}: '{key}' is not a projection K [I | t] of a rectified camera; get it again")
     size = stored_size(image)
     camera = pinhole(size, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]), calibration)
     cam0_from_cam = np.eye(4)

@@ -93,7 +93,7 @@ def _row(parts: tuple[str, ...], rows_of: Mapping[tuple[str, ...], list[int]], n
 
 
 def _parts(name: Any) -> tuple[str, ...]:
-    """A path's parts, without an image's suffix, as frames may lack it."""
+    """A path's parts, without an image's suffix, which frames may omit."""
     *folders, file = path_parts(str(name)) or ("",)
     path = PurePosixPath(file)
     return *folders, path.stem if path.suffix.lower() in IMAGE_SUFFIXES else file

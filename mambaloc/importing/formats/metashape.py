@@ -39,7 +39,7 @@ def is_metashape(source: Path) -> bool:
 
 
 def read_metashape(source: Path, images: Path | None = None) -> Capture:
-    """Read the aligned cameras of the chunk, and the component of it, that has most of them.
+    """Read the aligned cameras of the chunk, and the component of it, that has most aligned cameras.
 
     Args:
         source: the file, or its folder.
@@ -119,7 +119,7 @@ def _largest_chunk(path: Path) -> tuple[Element, list[str]]:
     """The chunk with most aligned cameras, and what is not read for it."""
     chunks = read_xml(path, "the cameras of a chunk of Metashape").findall("chunk")
     if not chunks:
-        raise InputError(f"{path}: holds no chunk; export the cameras again")
+        raise InputError(f"{path}: contains no chunk; export the cameras again")
     counts = [len(chunk.findall("cameras//camera/transform")) for chunk in chunks]
     best = counts.index(max(counts))
     others = [chunk.get("label") or "unnamed" for at, chunk in enumerate(chunks) if at != best]
@@ -134,7 +134,7 @@ def _to_chunk(path: Path, cameras: Sequence[Element]) -> tuple[Matrices, dict[in
         if values is not None and len(values) == 16:
             poses[row] = values.reshape(4, 4)
         else:
-            faults[row] = f"{path}: camera {(camera.get('label') or '')[:60]!r}: transform is no 4x4 matrix of numbers"
+            faults[row] = f"{path}: camera {(camera.get('label') or '')[:60]!r}: transform is not a 4x4 matrix"
     return poses, faults
 
 
@@ -144,7 +144,7 @@ def _to_world(path: Path, transform: Element, poses: Matrices) -> Matrices:
     rotation, translation, scale = (np.zeros(0) if each is None else each for each in told)
     is_whole = (len(rotation), len(translation), len(scale)) == (9, 3, 1)
     if not is_whole or not np.isfinite([*translation, *scale]).all() or not 1e-9 < scale[0] < 1e9:
-        raise InputError(f"{path}: the chunk's transform is no rotation, translation and scale; export it again")
+        raise InputError(f"{path}: the chunk's transform is not a rotation, translation and scale; export it again")
     matrix = np.c_[rotation.reshape(3, 3), translation]
     (turned,) = validate_se3(matrix[None], lambda _: f"{path}: the chunk's transform").poses
     if np.isnan(turned).any():
@@ -155,7 +155,7 @@ def _to_world(path: Path, transform: Element, poses: Matrices) -> Matrices:
 
 
 def _numbers(parent: Element, name: str) -> Matrices | None:
-    """The numbers of a child; None where there is none, or they are none."""
+    """The numbers of a child; None without it, or if it has no numbers."""
     text = parent.findtext(name)
     return None if text is None else as_numbers(text.split())
 
@@ -184,7 +184,7 @@ def _sensor(path: Path, chunk: Element, number: str) -> Camera:
     for name in ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"):
         values = _numbers(calibration, name) if calibration.find(name) is not None else np.zeros(1)
         if values is None or len(values) != 1 or not abs(values[0]) < 1e9:
-            raise InputError(f"{where}: {name} is no number; export the cameras again")
+            raise InputError(f"{where}: {name} is not a number; export the cameras again")
         told[name] = float(values[0])
     size = _size(calibration.find("resolution"), sensor.find("resolution"))
     focal, affinity = told["f"], (told["b1"], told["b2"])

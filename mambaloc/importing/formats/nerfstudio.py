@@ -45,7 +45,7 @@ _BAD = "marked is_bad by the capture"
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame of a file; ``split`` where the file tells it by where the frame is listed; ``fault`` of its matrix."""
+    """A frame of a file; ``split`` where the file's lists give it; ``fault`` of its matrix."""
 
     where: str
     name: Any
@@ -62,7 +62,7 @@ def matches(source: Path) -> bool:
 
 
 def read(source: Path, images: Path | None = None) -> Capture:
-    """Read a folder that holds such files, or one of them.
+    """Read a folder of such files, or a single file.
 
     A pose that is not finite or no rotation is kept: the checks name its frame and leave it out.
 
@@ -76,7 +76,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
     """
     files = [source] if source.is_file() else [source / name for name in FILES if (source / name).is_file()]
     if not files:
-        raise InputError(f"{source}: holds none of {', '.join(FILES)}; give a folder that does")
+        raise InputError(f"{source}: contains none of {', '.join(FILES)}; give a folder that does")
     contents = {file: _content(file) for file in (files[:1] if files[0].name == "transforms.json" else files)}
     frames = [frame for file, content in contents.items() for frame in _frames(file, content)]
     if all(frame.fault for frame in frames):
@@ -171,7 +171,7 @@ def _lists(contents: Mapping[Path, dict[str, Any]]) -> dict[str, list[str]]:
         for key in _LISTS:
             names = content.get(key) or []
             if not isinstance(names, list):
-                raise InputError(f"{file}: {key} is no list; correct it, or remove it")
+                raise InputError(f"{file}: {key} is not a list; correct it, or remove it")
             lists.setdefault(key.removesuffix("_filenames"), []).extend(map(str, names))
     return lists
 
@@ -193,7 +193,7 @@ def _original_from_file(file: Path, content: dict[str, Any]) -> tuple[Matrices, 
     except ValueError as error:
         raise InputError(f"{error}; correct it, or remove it") from None
     if not is_rotation(applied[:3, :3]) or not np.isfinite(applied).all():
-        raise InputError(f"{file}: applied_transform is no rotation and shift; correct it, or remove it")
+        raise InputError(f"{file}: applied_transform is not a rotation and translation; correct it, or remove it")
     return np.linalg.inv(applied).astype(np.float64), scale or 1.0
 
 
@@ -205,8 +205,8 @@ def _choices(file: str, content: dict[str, Any], other_files: Sequence[str]) -> 
         "direction": f"camera to world, as {file} has it",
         **_how_written(content),
         "world": world if undone else f"that of {file}",
-        "scale": "the format does not tell its unit",
-        "order": "by file name, its numbers as numbers, since the format tells no time; a folder is a sequence",
+        "scale": "the format does not state its unit",
+        "order": "by file name, its numbers as numbers, since the format has no times; a folder is a sequence",
     }
     of_frames = {key for frame in _all_frames(content) for key in frame}
     unread = [
@@ -258,7 +258,7 @@ def _matrix(value: Any, where: str, by_column: bool = False) -> Matrices:
     """
     numbers = _numbers(value)
     if numbers is None:
-        raise ValueError(f"{where} is no 4x4 or 3x4 matrix of numbers")
+        raise ValueError(f"{where} is not a 4x4 or 3x4 matrix of numbers")
     (matrix,) = matrices_of(numbers[None], by_column)
     if np.isfinite(matrix[3:]).all() and not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
         raise ValueError(f"{where}'s last row is not 0 0 0 1")

@@ -45,11 +45,9 @@ def read_cameras(
     """
     has_focal = [any(key in each for key in ("fl_x", "camera_angle_x")) for each in intrinsics]
     if not any(has_focal):
-        return {}, [None] * len(images), "none: the file tells no focal length"
+        return {}, [None] * len(images), "none: the file has no focal length"
     if not all(has_focal):
-        raise InputError(
-            f"{file}: tells a focal length of some frames, not of {images[has_focal.index(False)]}; add it"
-        )
+        raise InputError(f"{file}: some frames have a focal length, {images[has_focal.index(False)]} has none; add it")
     keys = [repr(sorted(each.items())) for each in intrinsics]
     frames: dict[str, list[int]] = {}
     for row, key in enumerate(keys):
@@ -65,7 +63,7 @@ def read_cameras(
 
 
 def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
-    """A finite number, or None where there is none.
+    """A finite number, or None without one.
 
     Raises:
         InputError: for anything else.
@@ -79,7 +77,7 @@ def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
 
 
 def _camera(told: Mapping[str, Any], images: Sequence[Path], where: str) -> Camera:
-    """A camera in pixels of the size that the file tells, or else of the first of its own images."""
+    """A camera in pixels of the size in the file, or else of the first of its own images."""
     size = [number(told, key, where) for key in "wh"]
     sides = [side for side in size if side] if all(size) else list(map(float, first_size(images)))
     focal = [_focal(told, axis, sides[axis], where) for axis in (0, 1)]
@@ -95,7 +93,7 @@ def _camera(told: Mapping[str, Any], images: Sequence[Path], where: str) -> Came
 
 
 def _focal(told: Mapping[str, Any], axis: int, side: float, where: str) -> float:
-    """Focal length along an axis in pixels, from the angle of view where that is told instead; 0 where neither is."""
+    """Focal length along an axis in pixels, from the angle of view where that is given instead; 0 where neither is."""
     key = "xy"[axis]
     if focal_px := number(told, f"fl_{key}", where):
         return focal_px

@@ -79,14 +79,14 @@ def read_table(path: Path, columns: int, row: str, named: bool = False, may_lack
         may_lack_fix: whether NaN and infinity are kept, which mark a pose without a fix.
 
     Raises:
-        InputError: where it cannot be read, holds no line, or one of its lines is anything else.
+        InputError: where it cannot be read, contains no line, or one of its lines is anything else.
     """
     lines = read_lines(path, f"a line each: {row}")
     numbers = np.empty((len(lines), columns))
     for at, (line, words) in enumerate(lines):
         values = as_numbers(words[int(named) :])
         if values is None or len(values) != columns or not (may_lack_fix or np.isfinite(values).all()):
-            raise InputError(f"{path}, line {line}: is no line {row!r} of finite numbers; correct or remove it")
+            raise InputError(f"{path}, line {line}: is not a line {row!r} of finite numbers; correct or remove it")
         numbers[at] = values
     if not lines:
         raise InputError(f"{path}: is empty; it holds a line each: {row}")
@@ -94,7 +94,7 @@ def read_table(path: Path, columns: int, row: str, named: bool = False, may_lack
 
 
 def as_numbers(words: Sequence[str]) -> NDArray[np.float64] | None:
-    """Numbers from words, not all of them finite perhaps; None where one is none."""
+    """Numbers from words, not all finite perhaps; None if a word is not a number."""
     try:
         return np.array([float(word) for word in words])
     except ValueError:
@@ -105,11 +105,11 @@ def read_object(path: Path, holds: str) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
-        InputError: where it cannot be read, or is none.
+        InputError: where it cannot be read, or is of another format.
     """
     value = read_json(path, f"it holds {holds}", f"it holds {holds}, export it again")
     if not isinstance(value, dict):
-        raise InputError(f"{path}: is no JSON object; it holds {holds}, export it again")
+        raise InputError(f"{path}: is not a JSON object; it holds {holds}, export it again")
     return value
 
 
@@ -117,7 +117,7 @@ def read_xml(path: Path, holds: str) -> ElementTree.Element:
     """Read the root of an XML file; one that declares a document type, as entities need, is refused unread.
 
     Raises:
-        InputError: where it cannot be read, or is none.
+        InputError: where it cannot be read, or is of another format.
     """
     text = read_text(path, holds)
 
@@ -130,7 +130,7 @@ def read_xml(path: Path, holds: str) -> ElementTree.Element:
         guard.Parse(text, True)
         return ElementTree.fromstring(text)
     except (expat.ExpatError, ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"{path}: is no XML ({error}); it holds {holds}, export it again") from None
+        raise InputError(f"{path}: is not XML ({error}); it holds {holds}, export it again") from None
 
 
 def array_of(
@@ -142,7 +142,7 @@ def array_of(
         value: lists of numbers, or a number.
         shape: what they must come in; None is any length.
         name: of the value, for messages.
-        path: the file, likewise.
+        path: the file, for messages.
         may_lack_fix: as of :func:`read_table`.
 
     Raises:
@@ -168,11 +168,11 @@ def inside(folder: Path, name: Any, where: str) -> Path:
         where: what names it, for messages.
 
     Raises:
-        InputError: for a name that leads out of the folder, or is none that a file can have.
+        InputError: for a name that leads out of the folder, or is not a valid file name.
     """
     path = path_inside(folder, name) if isinstance(name, str) else None
     if path is None:
-        raise InputError(f"{where}: names {str(name)[:60]!r}, which is no file inside of {folder}; correct the name")
+        raise InputError(f"{where}: names {str(name)[:60]!r}, which is not a file inside {folder}; correct the name")
     return path
 
 

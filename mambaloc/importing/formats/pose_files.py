@@ -2,8 +2,8 @@
 
 ``frame-000012.color.png`` with ``frame-000012.pose.txt`` is the layout of 7-Scenes (Shotton et al. 2013), of 12-Scenes
 and of 3RScan: a 4x4 camera-to-world matrix in metres. ``X.jpg`` with ``X.txt``, ``X.pose.txt`` or ``X.npy``, and
-``rgb/X.png`` with ``poses/X.txt`` (DSAC*, Brachmann and Rother 2021; Wayspots), are read likewise, in an unknown unit:
-4x4 or 3x4, row after row, or column after column where only that gives rotations.
+``rgb/X.png`` with ``poses/X.txt`` (DSAC*, Brachmann and Rother 2021; Wayspots), are read the same way, in an unknown
+unit: 4x4 or 3x4, row after row, or column after column where only that gives rotations.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
         direction: in which the matrices transform.
 
     Raises:
-        InputError: for a pose file that is damaged or of another kind, and where there is none.
+        InputError: for a pose file that is damaged or of another kind, and where no file is found.
     """
     groups = list(_groups(source))
     if not groups:
@@ -99,7 +99,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
         for row, ((name, image), camera, each) in enumerate(zip(images, names, depth, strict=True))
     ]
     told = {**({"written": "column after column"} if by_column else {}), **({"cameras": said} if said else {})}
-    unit = "metres, as 7-Scenes has them" if is_layout else "unknown: pose files do not tell"
+    unit = "metres, as 7-Scenes has them" if is_layout else "unknown: pose files do not state it"
     return build_capture(
         "pose_files",
         source,
@@ -198,7 +198,7 @@ def _numbers(file: Path) -> Matrices:
         try:
             array = np.load(file, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{file}: is no array of numbers ({error}). Save the 4x4 matrix alone.") from None
+            raise InputError(f"{file}: is not an array of numbers ({error}). Save the 4x4 matrix alone.") from None
         if array.shape not in ((4, 4), (3, 4)) or array.dtype.kind not in "fiu":
             raise InputError(f"{file}: is an array of shape {array.shape}, not of a 4x4 matrix. Save that alone.")
         return np.array(array, dtype=np.float64).ravel()
@@ -246,7 +246,7 @@ def _official_camera(image: Path) -> Camera | None:
 
 
 def _depth(source: Path, images: list[Path]) -> tuple[list[Path | None], Matrices | None]:
-    """Depth frames of images and their camera, where a file tells it or it is the official sensor's."""
+    """Depth frames of images and their camera, where a file has it or it is the official sensor's."""
     files = [path if (path := depth_path(image)).is_file() else None for image in images]
     first = next((path for path in files if path is not None), None)
     told = next((path for path in (source, source.resolve().parent) if (path / INTRINSICS_FILE).is_file()), None)

@@ -34,7 +34,7 @@ from mambaloc.importing.formats.timing import pair
 
 Direction = Literal["world_from_cam", "cam_from_world"]
 
-_CHOICES = {"axes": "OpenCV camera axes", "scale": "unknown: a pose file does not tell", "origin": "kept"}
+_CHOICES = {"axes": "OpenCV camera axes", "scale": "unknown: a pose file does not state it", "origin": "kept"}
 _TABLE = "Write a table poses.csv with the columns image,x,y,z,qw,qx,qy,qz (camera centre, camera-to-world)."
 _WORLD_FROM_CAM = "camera-to-world"
 _CAM_FROM_WORLD = "world-to-camera, inverted"
@@ -168,7 +168,7 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None, given: 
 
 
 def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tuple[Checked, Direction, dict[str, str]]:
-    """Poses of a position and a quaternion, in which direction they transform, and what was decided of them."""
+    """Poses of a position and a quaternion, in which direction they transform, and what was decided."""
     comes_first = layout.quaternion == 0
     if layout.is_unclear:
         raise InputError(f"{table.path}: its header does not say where the scalar of the quaternions is. {_TABLE}")

@@ -40,11 +40,11 @@ class Layout:
 
     Args:
         is_named: whether a word comes before the numbers.
-        is_text: whether that word is no number.
+        is_text: whether that word is not a number.
         count: of numbers: 7, 12 or 16.
         by_column: whether a matrix is written column after column.
         quaternion: place of its first number of seven.
-        header: the columns that a line above names, as many as there are; empty where there is none.
+        header: the columns that a line above names, as many as there are; empty without such a line.
     """
 
     is_named: bool
@@ -69,7 +69,7 @@ class Layout:
         """What the header of a file says of the positions' unit; None where it says nothing.
 
         Raises:
-            InputError: for a unit that is no length, or several.
+            InputError: for a unit that is not a length, or several.
         """
         return metres_per_unit(self._of_position, f"{path}: its header")
 
@@ -99,7 +99,7 @@ def split_line(line: str) -> tuple[str, list[str]]:
 
 
 def layout_of(path: Path) -> Layout | None:
-    """What a file's lines hold; None where they are no poses, or it cannot be read."""
+    """What a file's lines hold; None where they are not poses, or it cannot be read."""
     try:
         lines = read_text(path, "poses").splitlines()
     except InputError:
@@ -154,14 +154,14 @@ def _have_one_length(length: Matrices) -> bool:
 
 
 def _lengths(table: Matrices, place: int) -> Matrices:
-    """Of four numbers of each line that is no mark."""
+    """Of four numbers of each line that is not a mark."""
     quaternions = table[:, place : place + 4]
     with np.errstate(over="ignore"):
         return np.linalg.norm(quaternions[~is_mark(table, quaternions)], axis=1)
 
 
 def is_by_column(table: Matrices) -> bool | None:
-    """Whether transforms, (N, 12) or (N, 16), are written column after column; None where they are none either way."""
+    """Whether transforms, (N, 12) or (N, 16), are written column after column; None if neither way gives transforms."""
     return next((by_column for by_column in (False, True) if _are_transforms(matrices_of(table, by_column))), None)
 
 
@@ -222,7 +222,7 @@ def read_rows(path: Path, layout: Layout, row: str) -> Table:
         if values is None or len(values) != layout.count:
             if at == 0 and place < min(_HEADERS, len(lines) - 1):  # names of columns
                 continue
-            raise InputError(f"{path}, line {number}: is no line {row!r}, as the others are. Correct or remove it.")
+            raise InputError(f"{path}, line {number}: is not a line {row!r}, as the others are. Correct or remove it.")
         numbers[at] = values
         names.append(name)
         kept.append(number)

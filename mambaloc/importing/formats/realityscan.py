@@ -34,7 +34,7 @@ from mambaloc.text import natural, open_text
 
 _POSE = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 _LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-"""Columns that an export may lack; zeros then."""
+"""Columns that may be missing from an export; they are then zeros."""
 _NEWER = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 _FILM_MM = 36.0
 _BEFORE_HEADER = 5  # lines, as the number of cameras
@@ -43,7 +43,7 @@ _CHOICES = {
     "direction": "camera to world, as the format has it",
     "scale": "unknown: the export's coordinate system is not in the file",
     "origin": "kept",
-    "order": "by file name, its numbers as numbers, since the format tells no time",
+    "order": "by file name, its numbers as numbers, since the format has no times",
 }
 
 Row = tuple[int, str, Matrices]
@@ -131,7 +131,7 @@ def _rows(path: Path) -> list[Row]:
         row = dict(zip(names, map(str.strip, words), strict=False))
         numbers = as_numbers([row.get(name, "nan") for name in _POSE] + [row.get(name, "0") for name in _LENS])
         if len(words) != len(names) or numbers is None:
-            raise InputError(f"{path}, line {number}: is no row of a name and numbers; correct or remove it")
+            raise InputError(f"{path}, line {number}: is not a row of a name and numbers; correct or remove it")
         rows.append((number, row["name"], numbers))
     if not rows:
         raise InputError(f"{path}: has no row below its columns' names; align the images, and export again")

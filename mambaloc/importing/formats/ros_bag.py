@@ -113,7 +113,7 @@ def camera_from(told: BagCamera, where: str) -> Camera:
     """A bag's camera with its lens.
 
     Args:
-        told: by ``CameraInfo``.
+        told: the camera of ``CameraInfo``.
         where: it is, for messages.
 
     Raises:

@@ -47,7 +47,7 @@ def read_stray_scanner(source: Path) -> Capture:
     """Read poses, and choose frames of the video for sharpness and movement, which are kept in the user's cache.
 
     Raises:
-        InputError: for a file that is missing or damaged, or a video of which no frame has a pose.
+        InputError: for a file that is missing or damaged, or a video without a posed frame.
     """
     table = _odometry(source / _ODOMETRY)
     numbers = [_frame_number(table, row) for row in range(len(table.lines))]
@@ -96,13 +96,13 @@ def read_stray_scanner(source: Path) -> Capture:
 
 
 def _files_of(folder: Path, numbers: Sequence[int]) -> list[Path | None]:
-    """The PNG of each frame; None where there is none."""
+    """The PNG of each frame; None without one."""
     files = [folder / f"{number:06d}.png" for number in numbers]
     return [file if file.is_file() else None for file in files]
 
 
 def _depth_choice(depth: Sequence[Path | None], confidence: Sequence[Path | None]) -> dict[str, str]:
-    """What was decided of depth, by name; nothing where there is none."""
+    """What was decided of depth, by name; empty without depth."""
     count = sum(file is not None for file in depth)
     sure = sum(None not in pair for pair in zip(depth, confidence, strict=True))
     if not count:
@@ -128,7 +128,7 @@ def _odometry(path: Path) -> Table:
     for at, (line, row) in enumerate(rows):
         values = as_numbers([row[column] for column in columns]) if len(row) > max(columns) else None
         if values is None or not np.isfinite(values[:2]).all():
-            raise InputError(f"{path}, line {line}: is no row {', '.join(_POSE)} of numbers; correct or remove it")
+            raise InputError(f"{path}, line {line}: is not a row {', '.join(_POSE)} of numbers; correct or remove it")
         numbers[at] = values
     if not rows:
         raise InputError(f"{path}: has no row below its header; record again")
@@ -138,7 +138,7 @@ def _odometry(path: Path) -> Table:
 def _frame_number(table: Table, row: int) -> int:
     number = table.numbers[row, 1]
     if number < 0 or number != int(number):
-        raise InputError(f"{table.where(row)}: {number:g} is no number of a frame; correct or remove the row")
+        raise InputError(f"{table.where(row)}: {number:g} is not a frame's number; correct or remove the row")
     return int(number)
 
 
@@ -147,7 +147,7 @@ def _camera_matrix(path: Path) -> Matrices:
     rows = [line.split(",") for line in read_text(path, "a 3x3 matrix").splitlines() if line.strip()]
     values = as_numbers([word for row in rows for word in row])
     if values is None or [len(row) for row in rows] != [3, 3, 3]:
-        raise InputError(f"{path}: is no 3x3 matrix of numbers between commas; export the recording again")
+        raise InputError(f"{path}: is not a 3x3 matrix of numbers between commas; export the recording again")
     return values.reshape(3, 3)
 
 
@@ -160,7 +160,7 @@ def _camera(table: Table, row: int, size: tuple[int, int], matrix: Matrices, sou
 
 
 def _depth_camera(files: Sequence[Path], size: tuple[int, int], matrix: Matrices) -> Matrices | None:
-    """K of depth frames, which see what the video's frames see; None where there is none."""
+    """K of depth frames, which see what the video's frames see; None without depth."""
     if not files:
         return None
     height, width = read_depth_mm(files[0]).shape

@@ -36,7 +36,7 @@ class TableColumns:
         position: three.
         quaternion: four, scalar first.
         sequence: of a recording, where there is one.
-        time: likewise; of a table without images, a frame's number where there is no time.
+        time: of the frame; in a table without images or times, a frame's number.
         time_unit: that the time's name says; empty where it says none.
         metres_per_unit: what the position's names say; None where they say nothing.
     """

@@ -1,8 +1,8 @@
 """Which pose is which image's, where both are named by numbers: by equal names, or by the nearest time stamps.
 
-Time stamps are compared as whole nanoseconds: float64 is off by 128 of them at today's times. Their unit is found by
-their size. Times since 1970 are of one size in each unit, so that a file may mix units; of others the median step
-tells.
+Time stamps are compared as whole nanoseconds: float64 is off by 128 ns at today's times. Their unit is found by
+their size. Times since 1970 are of one size in each unit, so that a file may mix units; the unit of others follows from
+the median step.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SINCE_1970_S = (5 * 10**8, 5 * 10**9)  # from 1985 to 2128
 _LONGEST_STEP_S = 2  # from a frame to the next
 _LEAST_STEP_OF_WHOLE = 2000  # frames are numbered in smaller steps
 _LARGEST_NS = 2**62
-_MOST_FRAMES = 10**6  # a larger number is no frame's
+_MOST_FRAMES = 10**6  # a larger number is not a frame's
 _NUMBER = re.compile(r"\D*?(\d+(?:\.\d+)?)\D*", re.ASCII)
 
 
@@ -40,7 +40,7 @@ class Stamps:
 
     Args:
         ns: (N,) int64, nanoseconds.
-        unit: in which they were written; several where each of them tells its own.
+        unit: in which they were written; several where each has its own.
     """
 
     ns: NDArray[np.int64]
@@ -58,12 +58,12 @@ class Stamps:
 
 
 def stamps_of(words: Sequence[str], like: Stamps | None = None, said: str = "") -> Stamps | None:
-    """Times of words, in the unit that their size tells; None where one is no number.
+    """Times of words, in the unit that fits their size; None where one is not a number.
 
     Args:
         words: as they were written.
         like: other times of the same recording: of units that could be, the one in which both overlap most.
-        said: the unit that a file says they are in; taken where their size allows it.
+        said: the unit that a file states; taken where their size allows it.
     """
     numbers = [number for word in words if (number := _number(word)) is not None]
     if not numbers or len(numbers) < len(words):
@@ -105,7 +105,7 @@ def _possible(numbers: Sequence[Decimal]) -> list[str]:
 
 
 def _since_1970(number: Decimal) -> str | None:
-    """The unit in which a number is a time since 1970; None where it is none in any."""
+    """The unit in which a number is a time since 1970; None if it is a time in no unit."""
     first, last = _SINCE_1970_S
     return next((unit for unit, scale in _PER_S.items() if first * scale <= number < last * scale), None)
 
@@ -145,7 +145,7 @@ class Pairing:
     """Which pose is which image's.
 
     Args:
-        frames: each image that has a pose, the row of that, and the image's time; None where names are no times.
+        frames: each image that has a pose, the row of that, and the image's time; None where names are not times.
         how: it was found, for ``choices``.
         missing: names of poses whose image is not there.
     """
@@ -164,7 +164,7 @@ def pair(images: Sequence[Path], words: Sequence[str], listing: Path) -> Pairing
         listing: the file of the poses, for messages.
 
     Raises:
-        InputError: where names do not tell which pose is which image's.
+        InputError: where names do not match poses to images.
     """
     named, stamps = _by_name(images, words), image_stamps(images)
     if named is not None:
@@ -172,7 +172,7 @@ def pair(images: Sequence[Path], words: Sequence[str], listing: Path) -> Pairing
         return Pairing(_frames(images, stamps, pairs), how, missing)
     if stamps is None:
         raise InputError(
-            f"{listing}: does not tell which pose is which image's: {images[0].name!r} is neither a time stamp such "
+            f"{listing}: its poses cannot be matched to images: {images[0].name!r} is neither a time stamp such "
             f"as 1305031102.175304.png, nor in its first column. Write the images' names into its first column, or "
             f"lines 'timestamp file' to {listing.with_name('rgb.txt')} and call the trajectory groundtruth.txt."
         )
@@ -197,11 +197,11 @@ def by_time(named: Path, stamps: Stamps, words: Sequence[str], listing: Path) ->
         listing: the file of the poses, for messages.
 
     Raises:
-        InputError: where a word is no time, or none is near.
+        InputError: where a word is not a time, or none is near.
     """
     poses = stamps_of(words, like=stamps)
     if poses is None:
-        raise InputError(f"{listing}: its first column is no time stamp in seconds throughout; correct it")
+        raise InputError(f"{listing}: its first column is not a time stamp in seconds throughout; correct it")
     pairs = associated(stamps.ns, poses.ns, round(FARTHEST_S * 1e9))
     if not pairs:
         raise InputError(
@@ -214,7 +214,7 @@ def by_time(named: Path, stamps: Stamps, words: Sequence[str], listing: Path) ->
 def associated(first: NDArray[Any], second: NDArray[Any], farthest: float = FARTHEST_S) -> list[tuple[int, int]]:
     """Pair each of the first time stamps with the nearest of the second that is nearer than the farthest.
 
-    Where one is nearest to several, the closest of them alone keeps it: no pose is given to two images.
+    Where one is nearest to several, only the closest keeps it: no pose is given to two images.
 
     Returns:
         Pairs of indices, in the order of the first.

@@ -54,7 +54,7 @@ def read_tum_rgbd(source: Path, images: Path | None = None) -> Capture:
     named, words_of = [], []
     for line, words in read_lines(listing, "a line each: timestamp file"):
         if len(words) != 2 or stamps_of(words[:1]) is None:
-            raise InputError(f"{listing}, line {line}: is no line 'timestamp file'; correct or remove it")
+            raise InputError(f"{listing}, line {line}: is not a line 'timestamp file'; correct or remove it")
         named.append((words[1], f"{listing}, line {line}"))
         words_of.append(words[0])
     if not named:
@@ -81,7 +81,7 @@ def read_tum(source: Path) -> Capture:
     """Read a trajectory beside an image folder, whose files are named by time stamps or by its first column.
 
     Raises:
-        InputError: for a file that is missing or damaged, or where names do not tell which pose is which image's.
+        InputError: for a file that is missing or damaged, or where names do not match poses to images.
     """
     path = only_file(_trajectories(source), source)
     table, layout = _read_trajectory(path)
@@ -93,7 +93,9 @@ def read_tum(source: Path) -> Capture:
 def _read_trajectory(path: Path) -> tuple[Table, Layout]:
     layout = layout_of(path) or Layout(is_named=True, is_text=False, count=7)
     if (layout.is_named, layout.count, layout.quaternion) != (True, 7, 3):
-        raise InputError(f"{path}: does not have lines {_ROW!r}. Leave --format out, and its lines tell what it is.")
+        raise InputError(
+            f"{path}: does not have lines {_ROW!r}. Omit --format: the format is found by the file's lines."
+        )
     if layout.is_unclear:
         raise InputError(
             f"{path}: its header does not say where the scalar of the quaternions is. Name the columns in it: {_ROW}, "
@@ -103,7 +105,7 @@ def _read_trajectory(path: Path) -> tuple[Table, Layout]:
 
 
 def _trajectories(source: Path) -> list[Path]:
-    """Files of time stamps and seven numbers; those of a trajectory's name where their lines tell nothing."""
+    """Files of time stamps and seven numbers; those of a trajectory's name where their lines are ambiguous."""
     if source.is_file():
         return [source] if _is_trajectory(source, layout_of(source)) else []
     named = [source / name for name in _TRAJECTORIES] + (sorted(source.glob("*.tum")) if source.is_dir() else [])
@@ -135,7 +137,7 @@ def _capture(
     checked = from_quaternions(table.numbers[:, :3], quaternion, table.where)
     unit: Unit = "metre" if kind == "tum_rgbd" else "unknown"
     length_m = layout.metres_per_unit(table.path)
-    known = "metres, as the benchmark has them" if unit == "metre" else "unknown: a trajectory does not tell"
+    known = "metres, as the benchmark has them" if unit == "metre" else "unknown: a trajectory does not state it"
     choices = {
         "axes": "OpenCV camera axes, as the format has them",
         "direction": f"camera-to-world, scalar {scalar}, as {said}",

@@ -52,7 +52,7 @@ def reconstruct(job: Job, source: Path, remedy: str, progress: Progress) -> int:
         progress: gets a task for each step.
 
     Returns:
-        How many images the largest model places; 0 where there is none.
+        How many images the largest model places; 0 without a model.
 
     Raises:
         InputError: where COLMAP gives up, or its process ends before its work.
@@ -87,7 +87,7 @@ def reconstruct(job: Job, source: Path, remedy: str, progress: Progress) -> int:
 
 def _started(job: Path, stderr: int) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-P", str(_PROGRAM), str(job)],  # -P: the program's folder holds no modules for it
+        [sys.executable, "-P", str(_PROGRAM), str(job)],  # -P: the program's folder contains no modules for it
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=stderr,

@@ -1,6 +1,6 @@
-"""Images without poses, a video or a folder of photographs: posed by structure from motion.
+"""Images without poses, a video or a folder of photos: posed by structure from motion.
 
-Frames of a video are chosen for sharpness and movement, and matched with their neighbours; of a few photographs every
+Frames of a video are chosen for sharpness and movement, and matched with their neighbours; of a few photos every
 pair is. All images of one size share a camera with a radial distortion. The scale is arbitrary. What was made is kept
 in the user's cache and found again, unless the images change.
 """
@@ -31,7 +31,7 @@ from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
 from mambaloc.user_cache import made_once
 
 _NEIGHBOURS = 10  # before and after a video's frame that it is matched with, beside those 2, 4, 8, ... apart
-_VERSION = 1  # of what is kept: another one is made anew
+_VERSION = 1  # of what is kept: another one is made again
 _MOST_PHOTOGRAPHS = 60  # every pair of so many is matched; a folder of more is taken for a video's frames
 _MOST_FRAMES = 400  # of a video: placing a hundred takes minutes
 _FEWEST_FRAMES = 5
@@ -85,7 +85,7 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
 
 
 def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
-    """Fill a folder with chosen images, the largest model of them, and a note of what was decided."""
+    """Fill a folder with chosen images, the largest model, and a note of what was decided."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     images = folder / "images"
     images.mkdir()
@@ -107,7 +107,7 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
         raise InputError(f"{source}: only {share} could be placed, less than {_LEAST_PLACED:.0%}; {_ADVICE}")
     chosen = f"{len(names)} of {seen.count}, by sharpness and movement"
     choices = {
-        "frames": chosen if is_film else f"all {len(names)} photographs",
+        "frames": chosen if is_film else f"all {len(names)} photos",
         "matching": f"{_NEIGHBOURS} neighbours of each, and farther ones" if is_film else "every pair",
         "registered": f"{share} ({placed / len(names):.0%})",
         **choices_of(counts),

@@ -49,8 +49,8 @@ class Proposal:
         how: in a line.
         split: ``train``, ``val``, ``test`` or ``unused``, of each frame.
         length: from each test frame to its nearest training frame: 10 % quantile, median and 90 % quantile.
-        turn_deg: likewise.
-        steps: likewise.
+        turn_deg: quantiles of the angle to its view direction.
+        steps: quantiles of the distance in median frame spacings.
         near: share of test frames within :data:`NEAR_STEPS` steps.
         is_learnable: the median is within reach.
     """
@@ -80,7 +80,7 @@ class Proposal:
         return {split: int((self.split == split).sum()) for split in ("train", "val", "test", "unused")}
 
     def figures(self) -> Mapping[str, Any]:
-        """What ``scene.json`` tells of it."""
+        """Describe the split for ``scene.json``."""
         quantiles = {"length": self.length, "turn_deg": self.turn_deg, "steps": self.steps}
         return {
             "by": self.kind,
@@ -114,7 +114,7 @@ def choose(proposals: Sequence[Proposal], asked: str, capture: Capture) -> Chose
         capture: that they split.
 
     Raises:
-        InputError: where there is none of the kind that was asked for.
+        InputError: if no split of the kind asked for exists.
     """
     if asked != "auto":
         taken = next((each for each in proposals if each.kind == asked), None)
@@ -142,7 +142,7 @@ _LACKS = {
 
 
 def _lacks_given(capture: Capture) -> str:
-    """Why a capture's own split is none."""
+    """Why a capture's own split cannot be used."""
     if capture.split is None:
         return capture.split_concern or "no split of its own"
     counts = " and ".join(f"{capture.split.count(split)} {split} frames" for split in ("train", "test"))

@@ -44,7 +44,7 @@ class Decoding:
         upright: poses mean upright pixels; otherwise those that the files hold. A camera's size may say otherwise of
             its own images.
         count: how many images there are.
-        counts: black and white of 16-bit images; None where there are none.
+        counts: black and white of 16-bit images; None without any.
         turned: images with an EXIF orientation that were turned upright.
         stored: images with one that were taken as stored.
     """
@@ -88,7 +88,7 @@ class Decoding:
 
 
 def choices_of(counts: Counts | None) -> dict[str, str]:
-    """What was decided of 16-bit images, by name; nothing where there are none."""
+    """What was decided of 16-bit images, by name; empty without any."""
     if counts is None:
         return {}
     black, white = counts
@@ -100,7 +100,7 @@ def choices_of(counts: Counts | None) -> dict[str, str]:
 
 
 def decoding_of(capture: Capture) -> Decoding:
-    """Find out how to decode a capture's images from their first bytes, and from a few of them."""
+    """Find out how to decode a capture's images from their first bytes, and from a few whole images."""
     images = capture.images
     with ThreadPoolExecutor() as pool:
         heads = list(pool.map(_orientation_and_depth, images))

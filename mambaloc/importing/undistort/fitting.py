@@ -36,7 +36,7 @@ class FittedCameras:
         self.lock = Lock()  # the first images of a camera all ask for its maps
 
     def size(self, name: str) -> Size:
-        """Of the images that a camera is told for."""
+        """Size of the images that a camera is given for."""
         return self.told[name].size
 
     def fitted(self, name: str, size: Size) -> tuple[Camera, Maps | None] | None:

@@ -60,7 +60,7 @@ def read_pose_table(path: Path, scene: str, layout: Layout) -> list[Shot]:
     camera-to-world for 7-Scenes, world-to-camera for Cambridge; it is normalised.
 
     Raises:
-        InputError: for a missing column, a row that is no pose, or a scene that is not in the table.
+        InputError: for a missing column, a row that is not a pose, or a scene that is not in the table.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give a CSV with the columns {','.join(_COLUMNS)}")
@@ -69,14 +69,14 @@ def read_pose_table(path: Path, scene: str, layout: Layout) -> list[Shot]:
     with open_text(path, newline="") as file:
         rows = csv.DictReader(file)
         if missing := [name for name in _COLUMNS if name not in (rows.fieldnames or ())]:
-            raise InputError(f"{path}, line 1: lacks the columns {','.join(missing)}; name them in the first line")
+            raise InputError(f"{path}, line 1: columns {', '.join(missing)} are missing; name them in the first line")
         try:
             for row in rows:
                 scenes.add(row["scene"])
                 if row["scene"] == scene:
                     shots.append(_shot(row, layout, f"{path}, line {rows.line_num}"))
         except csv.Error as error:  # a field without end
-            raise InputError(f"{path}, line {rows.line_num}: is no row of a CSV ({error}); correct it") from None
+            raise InputError(f"{path}, line {rows.line_num}: is not a row of a CSV ({error}); correct it") from None
     if not shots:
         raise InputError(f"{path}: has no row of scene {scene!r}; choose one of {', '.join(sorted(map(str, scenes)))}")
     return shots

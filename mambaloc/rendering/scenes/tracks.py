@@ -21,7 +21,7 @@ def write_nvm(
 ) -> None:
     """Write cameras and points as Cambridge Landmarks ships them, its images named ``.jpg``.
 
-    A point is tracked in every image that it projects into at the depth rendered there; it needs two of them.
+    A point is tracked in every image that it projects into at the depth rendered there; it needs two images.
 
     Args:
         path: the file.

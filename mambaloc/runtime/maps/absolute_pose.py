@@ -45,7 +45,7 @@ class CameraPose:
 
 
 def ransac_pose(points_m: Floats, rays: Floats, near: float, rng: np.random.Generator) -> CameraPose | None:
-    """Find the pose that most matches agree with, by RANSAC, and SQPnP on those; None where there is none.
+    """Find the pose that most matches agree with, by RANSAC, and SQPnP on those; None if no pose is found.
 
     Args:
         points_m: (M, 3).

@@ -93,9 +93,9 @@ def test_a_missing_image_is_rejected_or_skipped_and_counted(scene):
 
 
 BAD_ROWS = {
-    "line 4: image '../../x.png' is no path inside": ("image", "../../x.png"),
-    "line 4: image '/x.png' is no path inside": ("image", "/x.png"),
-    "line 4: image '' is no path inside": ("image", ""),
+    "line 4: image '../../x.png' is not a path inside": ("image", "../../x.png"),
+    "line 4: image '/x.png' is not a path inside": ("image", "/x.png"),
+    "line 4: image '' is not a path inside": ("image", ""),
     "line 4: images/walk/001.png is on line 3, too": ("image", "images/walk/001.png"),
     "line 4: names no sequence": ("sequence", ""),
     "are not all numbers": ("x", "one"),
@@ -105,7 +105,7 @@ BAD_ROWS = {
     "line 4: has NaN or infinite numbers  ": ("time_s", "-inf"),
     "line 4: lies farther than 1e+07 from the origin": ("z", "1e9"),
     "line 4: quaternion has length": ("qw", "3"),
-    "line 4: split 'validation' is none of train, val, test, unused": ("split", "validation"),
+    "line 4: split 'validation' is not one of train, val, test, unused": ("split", "validation"),
     "line 4: has 13 columns, not 12": ("split", "train,x"),
 }
 
@@ -126,8 +126,8 @@ def test_a_bad_row_is_named_by_its_line(scene, message, change):
         (b"", "frames.csv, line 1: is not image,sequence"),
         (b"image,split\n", "frames.csv, line 1: is not image,sequence"),
         (",".join(COLUMNS).encode() + b"\n", "frames.csv: has no row"),
-        (bytes(range(256)), "frames.csv: is no CSV"),
-        (",".join(COLUMNS).encode() + b'\n"a\n', "frames.csv: is no CSV"),
+        (bytes(range(256)), "frames.csv: is not CSV"),
+        (",".join(COLUMNS).encode() + b'\n"a\n', "frames.csv: is not CSV"),
     ],
 )
 def test_a_table_that_is_none(scene, content, message):
@@ -142,7 +142,7 @@ def test_a_table_that_is_none(scene, content, message):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "scene.json: is no JSON"),
+        ("{", "scene.json: is not JSON"),
         ("[]", "scene.json: is not of an imported scene"),
         ('{"mambaloc_scene": 2}', "scene.json: is of version 2, this reads 1"),
         ('{"mambaloc_scene": 1, "sanity": {"verdict": "not usable: 3 frames"}}', "was found not usable: 3 frames"),
@@ -205,12 +205,12 @@ def test_what_is_no_scene_says_how_to_make_one(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "raw").mkdir()
     for name, message in {
-        "scenes/dan": "scenes/dan: is no imported scene; make one with: mambaloc import CAPTURE --out",
-        "./raw": "raw: is no imported scene; make one with: mambaloc import raw --out scenes/raw",
+        "scenes/dan": "scenes/dan: is not an imported scene; make one with: mambaloc import CAPTURE --out",
+        "./raw": "raw: is not an imported scene; make one with: mambaloc import raw --out scenes/raw",
     }.items():
         with pytest.raises(InputError, match=re.escape(message)):
             scene_folder(*[None if part is None else part for part in locate("7scenes", None, name)])
-    with pytest.raises(InputError, match="scenes/dan: is no imported scene; make one with"):
+    with pytest.raises(InputError, match="scenes/dan: is not an imported scene; make one with"):
         scene_folder("capture", None, "dan")
     monkeypatch.chdir(tmp_path / "scenes")
     with pytest.raises(InputError, match=re.escape("name its path: --data.scene ./den")):

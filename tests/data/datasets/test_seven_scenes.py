@@ -128,9 +128,9 @@ def expect_rejection(scene, path: Path, rule: str) -> None:
         (None, "TrainSplit.txt: missing"),
         ("", "TrainSplit.txt: lists no sequence"),
         (" \n\n", "TrainSplit.txt: lists no sequence"),
-        ("sequence1\nseq-02\n", "TrainSplit.txt, line 2: 'seq-02' is no 'sequenceN'"),
-        ("sequence1 sequence2\n", "TrainSplit.txt, line 1: 'sequence1 sequence2' is no 'sequenceN'"),
-        ("sequence-1\n", "TrainSplit.txt, line 1: 'sequence-1' is no 'sequenceN'"),
+        ("sequence1\nseq-02\n", "TrainSplit.txt, line 2: 'seq-02' is not a 'sequenceN'"),
+        ("sequence1 sequence2\n", "TrainSplit.txt, line 1: 'sequence1 sequence2' is not a 'sequenceN'"),
+        ("sequence-1\n", "TrainSplit.txt, line 1: 'sequence-1' is not a 'sequenceN'"),
         ("\x00\x01\ufffd", "TrainSplit.txt, line 1: "),
         ("sequence1\nsequence7\n", "TrainSplit.txt: lists sequence7, but there is no "),
         ("sequence1\nsequence2\nsequence01\n", "TrainSplit.txt, line 3: lists sequence1 again"),
@@ -153,7 +153,7 @@ def test_no_usable_frame_is_an_error_even_when_skipping(write_tiny_scene):
     for pose in scene.folder.glob("seq-01/*.pose.txt"):
         pose.write_text(POSE_TEXT.replace("0.5", "nan"))
     bad = BadFrames("skip")
-    with pytest.raises(InputError, match=r"TrainSplit\.txt: its sequences hold no usable frame"):
+    with pytest.raises(InputError, match=r"TrainSplit\.txt: its sequences contain no usable frame"):
         read_split(scene.folder, "train", bad)
     assert bad.counts() == {"pose has NaN or infinite numbers": 2}
 

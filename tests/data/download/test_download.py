@@ -181,7 +181,7 @@ def test_cambridge_with_and_without_a_top_folder(server: Server, tmp_path: Path)
         source = server.source(zipped(members, zipfile.ZIP_DEFLATED), name, CAMBRIDGE)
         get(source, tmp_path, name)
         assert files_in(tmp_path / name) == set(scene)
-        assert source.lacks(tmp_path / name) is None
+        assert source.missing(tmp_path / name) is None
 
 
 @pytest.mark.parametrize("tags", [{}, {"etag": None, "date": "Tue, 01 Jan 2013 00:00:00 GMT"}])
@@ -367,7 +367,9 @@ def test_a_damaged_archive_leaves_no_scene(server: Server, tmp_path: Path) -> No
 
 
 def test_another_archive_than_a_scenes_is_refused(server: Server, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"holds no TrainSplit.txt and TestSplit.txt: it is not a scene of 7-Scenes"):
+    with pytest.raises(
+        InputError, match=r"contains no TrainSplit.txt and TestSplit.txt: it is not a scene of 7-Scenes"
+    ):
         get(server.source(zipped({"readme.txt": b""})), tmp_path)
 
 
@@ -384,7 +386,7 @@ def test_a_malformed_split_file_is_named_as_the_reader_names_it(tmp_path: Path) 
     (tmp_path / "heads/seq-01").mkdir(parents=True)
     for split in SEVENSCENES.splits:
         (tmp_path / "heads" / split).write_text("sequence1\nseq-01\n")
-    with pytest.raises(InputError, match=r"TrainSplit\.txt, line 2: 'seq-01' is no 'sequenceN'"):
+    with pytest.raises(InputError, match=r"TrainSplit\.txt, line 2: 'seq-01' is not a 'sequenceN'"):
         download("7scenes", "heads", tmp_path)
 
 
@@ -442,8 +444,8 @@ def test_all_gets_every_scene(server: Server, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: download("7scene", "heads"), "'7scene' is no dataset .* Did you mean 7scenes?"),
-        (lambda: download("7scenes", "haeds"), "'haeds' is no scene of 7-Scenes. Did you mean heads?"),
+        (lambda: download("7scene", "heads"), "'7scene' is not a dataset .* Did you mean 7scenes?"),
+        (lambda: download("7scenes", "haeds"), "'haeds' is not a scene of 7-Scenes. Did you mean heads?"),
         (lambda: download("cambridge", "kingscollege"), "Did you mean KingsCollege?"),
         (lambda: download("7scenes", "zzz"), "Choose one of chess, fire, heads, .*, all"),
         (lambda: download("7scenes", None), "7scenes needs a scene: give one of chess, .*, or all"),
@@ -488,4 +490,4 @@ def test_the_tool_ends_in_one_line_and_code_2(tmp_path: Path) -> None:
         text=True,
     )
     assert done.returncode == 2
-    assert done.stderr == "error: 'haeds' is no scene of 7-Scenes. Did you mean heads?\n"
+    assert done.stderr == "error: 'haeds' is not a scene of 7-Scenes. Did you mean heads?\n"

@@ -192,7 +192,7 @@ def one_line(folder: Path) -> str:
 def test_bad_intrinsics_are_named(tiny, text):
     write_depth(tiny.images[0], np.full((24, 32), 900, np.uint16))
     (tiny.folder / "camera-intrinsics.txt").write_text(text)
-    assert "camera-intrinsics.txt: is no pinhole matrix" in one_line(tiny.folder)
+    assert "camera-intrinsics.txt: is not a pinhole matrix" in one_line(tiny.folder)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "text", "8 bit", "colour"])
@@ -216,7 +216,7 @@ def test_depth_of_another_size_is_named(tiny):
 
 def test_no_point_at_all_is_an_error(tiny):
     write_depth(tiny.images[0], np.zeros((24, 32), np.uint16))
-    assert "its depth holds no point for any of 3 frames" in one_line(tiny.folder)
+    assert "its depth contains no point for any of 3 frames" in one_line(tiny.folder)
 
 
 def test_without_any_source_the_three_places_are_named(tiny):

@@ -221,13 +221,19 @@ def test_a_model_in_another_frame_or_scale_is_refused(yard, a, b, says):
         (nvm(CAMERAS, ["1 2 3 0 0 0 2 0 0 0 0"]), "line 9: is a point with a track of 2, but has 4 numbers of it"),
         (nvm(CAMERAS, ["1 2 3 0 0 0 -1"]), "line 9: is a point with a track of -1"),
         (nvm(CAMERAS, ["1 2 3 0 0 0 999999999999 0 0 0 0"]), "line 9: is a point with a track of 999999999999"),
-        (nvm(CAMERAS, ["1 2 3 0 0 0 1 3 0 0 0"]), "line 9: is a point seen by an image that is none of the 3 cameras"),
-        (nvm(CAMERAS, ["1 2 3 0 0 0 1 -1 0 0 0"]), "line 9: is a point seen by an image that is none of the 3 cameras"),
+        (
+            nvm(CAMERAS, ["1 2 3 0 0 0 1 3 0 0 0"]),
+            "line 9: is a point seen by an image that is not one of the 3 cameras",
+        ),
+        (
+            nvm(CAMERAS, ["1 2 3 0 0 0 1 -1 0 0 0"]),
+            "line 9: is a point seen by an image that is not one of the 3 cameras",
+        ),
         (nvm(CAMERAS, POINTS, tail=POINTS[0]), "line 14: follows the last of the points"),
         ("NVM_V3\n" + "1" * (1 << 22), "line 2: is too long"),
-        (nvm(["seq9/z.jpg 100 1 0 0 0 1 2 3 0 0"], []), "holds none of 4 frames, such as"),
-        (nvm([". 100 1 0 0 0 1 2 3 0 0"], []), "holds none of 4 frames, such as"),
-        (nvm(CAMERAS, POINTS[3:]), "its nvm holds no point for any of 4 frames"),
+        (nvm(["seq9/z.jpg 100 1 0 0 0 1 2 3 0 0"], []), "contains none of 4 frames, such as"),
+        (nvm([". 100 1 0 0 0 1 2 3 0 0"], []), "contains none of 4 frames, such as"),
+        (nvm(CAMERAS, POINTS[3:]), "its nvm contains no point for any of 4 frames"),
         ("NVM_V3\n\x00\xff\n", "line 2: is not the number of cameras"),
     ],
 )
@@ -315,12 +321,12 @@ def test_a_damaged_colmap_model_is_named_in_one_line(yard, file, keep):
 @pytest.mark.parametrize(
     ("file", "line", "says"),
     [
-        ("points3D.txt", "", "its colmap holds no point for any of 4 frames"),
+        ("points3D.txt", "", "its colmap contains no point for any of 4 frames"),
         ("cameras.txt", "1 PINHOLE 0 60 100 102 41 29\n", "holds a camera without a size"),
         ("cameras.txt", "1 PINHOLE 80 60 0 102 41 29\n", "holds a camera without a size"),
-        ("cameras.txt", "1 PINHOLE 80 60 nan 102 41 29\n", "is no COLMAP model that pycolmap can read"),
-        ("cameras.txt", "1 PINHOLE\n", "is no COLMAP model that pycolmap can read"),
-        ("images.txt", "text\n\n", "images.txt, line 1: is no image 'IMAGE_ID QW"),
+        ("cameras.txt", "1 PINHOLE 80 60 nan 102 41 29\n", "is not a COLMAP model that pycolmap can read"),
+        ("cameras.txt", "1 PINHOLE\n", "is not a COLMAP model that pycolmap can read"),
+        ("images.txt", "text\n\n", "images.txt, line 1: is not an image 'IMAGE_ID QW"),
     ],
 )
 def test_a_damaged_text_model_is_named_in_one_line(yard, file, line, says):

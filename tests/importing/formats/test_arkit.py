@@ -118,7 +118,7 @@ def test_what_is_no_recording(record3d, refused, tmp_path):
     whole = (record3d / "metadata").read_text()
     for content in (whole[: len(whole) // 2], "[]", "", "[" * 100_000):
         (record3d / "metadata").write_text(content)
-        refused(read_record3d, record3d, "metadata: is no JSON")
+        refused(read_record3d, record3d, "metadata: is not JSON")
     (record3d / "metadata").unlink()
     refused(read_record3d, record3d, "metadata.json: cannot be read")
     (tmp_path / "a.r3d").write_bytes(b"PK")
@@ -202,7 +202,7 @@ def test_polycam_damage_is_named_in_one_line(polycam, recording, refused, change
     damaged.write_text(keyframe(arkit(recording.world_from_cam)[2], **change))
     refused(read_polycam, polycam, says, str(damaged))
     damaged.write_text(damaged.read_text()[:30])
-    refused(read_polycam, polycam, "is no JSON", str(damaged))
+    refused(read_polycam, polycam, "is not JSON", str(damaged))
 
 
 def test_a_polycam_matrix_that_is_no_rotation_is_left_out_by_name(polycam, recording):

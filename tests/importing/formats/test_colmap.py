@@ -144,7 +144,7 @@ def test_several_cameras_are_told_apart(recording, tmp_path):
 def test_names_that_lead_out_are_refused(recording, tmp_path, refused, names):
     write_model(recording, tmp_path / "sparse", names=names + NAMES[1:])
     recording.write(tmp_path / "images", NAMES)
-    refused(read_colmap, tmp_path, "which is no file inside of")
+    refused(read_colmap, tmp_path, "which is not a file inside of")
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "frames.bin", "points3D.bin", "rigs.bin"])
@@ -165,7 +165,7 @@ def test_a_cut_file_is_named_in_one_line(recording, tmp_path, refused, file, sha
         ("cameras.txt", " 60 33", " 0 33", "without a size or a finite, positive focal length"),
         ("cameras.txt", " 64 48 ", " 0 48 ", "without a size or a finite, positive focal length"),
         ("cameras.txt", " 64 48 ", " 40000 48 ", "a camera has 40000x48 pixels, more than 32766 a side"),
-        ("cameras.txt", "SIMPLE_RADIAL", "ROUND", "is no COLMAP model that pycolmap can read"),
+        ("cameras.txt", "SIMPLE_RADIAL", "ROUND", "is not a COLMAP model that pycolmap can read"),
     ],
 )
 def test_a_damaged_text_is_named_in_one_line(recording, tmp_path, refused, file, old, new, says):
@@ -180,7 +180,7 @@ def test_a_damaged_text_is_named_in_one_line(recording, tmp_path, refused, file,
 def test_a_model_without_its_images(recording, tmp_path, refused):
     write_model(recording, tmp_path / "sparse")
     refused(read_colmap, tmp_path, "6 are named and missing, such as 'run/9.jpg'")
-    refused(read_colmap, tmp_path / "sparse" / "none", "holds no COLMAP model")
+    refused(read_colmap, tmp_path / "sparse" / "none", "contains no COLMAP model")
 
 
 def test_without_pycolmap_the_extra_is_named(recording, tmp_path, refused, monkeypatch):

@@ -189,17 +189,17 @@ HEADER = "image,x,y,z,qw,qx,qy,qz\n"
         (HEADER + ROW + "a.jpg,0,0\n", "line 3: has 3 fields where the first line names 8"),
         (HEADER + ROW.replace("1", "one"), "line 2: x,y,z,qw,qx,qy,qz must be numbers"),
         (HEADER + ROW.replace("1", "0.1"), "line 2: the quaternion is far from unit length"),
-        (HEADER + ROW.replace("a.jpg", "../b.jpg"), "line 2: names '../b.jpg', which is no file inside of"),
-        (HEADER + ROW.replace("a.jpg", "/b.jpg"), "line 2: names '/b.jpg', which is no file inside of"),
-        (HEADER + ROW.replace("a.jpg", ""), "line 2: names '', which is no file inside of"),
+        (HEADER + ROW.replace("a.jpg", "../b.jpg"), "line 2: names '../b.jpg', which is not a file inside of"),
+        (HEADER + ROW.replace("a.jpg", "/b.jpg"), "line 2: names '/b.jpg', which is not a file inside of"),
+        (HEADER + ROW.replace("a.jpg", ""), "line 2: names '', which is not a file inside of"),
         (HEADER + ROW, "has no image with a pose"),
         (
             HEADER.replace("image", "split,image") + "holdout," + ROW,
-            "line 2: split 'holdout' is none of train, val, test",
+            "line 2: split 'holdout' is not one of train, val, test",
         ),
-        (HEADER.replace("image", "time,image") + "noon," + ROW, "line 2: time 'noon' is no number of seconds"),
+        (HEADER.replace("image", "time,image") + "noon," + ROW, "line 2: time 'noon' is not a number of seconds"),
         (HEADER + ROW * 2, "more than one pose"),
-        (HEADER + '"' + "a" * 200_000 + '"\n', "is no CSV (field larger than field limit"),
+        (HEADER + '"' + "a" * 200_000 + '"\n', "is not CSV (field larger than field limit"),
     ],
 )
 def test_damage_is_named_in_one_line(tmp_path, recording, refused, content, says):

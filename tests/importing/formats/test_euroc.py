@@ -98,7 +98,7 @@ def test_poses_of_the_body_are_those_that_evo_reads(source):
 
 
 def test_the_ground_truth_may_be_of_a_marker_elsewhere_on_the_body(source, walk):
-    """As the datasets' vicon0 is, whose T_BS is no identity; TUM-VI calls its folder mocap0."""
+    """As the datasets' vicon0 is, whose T_BS is not an identity; TUM-VI calls its folder mocap0."""
     body_from_marker = np.eye(4)
     body_from_marker[:3] = np.c_[Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix(), [0.1, -0.05, 0.2]]
     world_from_marker = walk.world_from_cam @ np.linalg.inv(BODY_FROM_CAM) @ body_from_marker
@@ -151,24 +151,24 @@ def zeroed(line: str) -> str:
 CAM, TRUTH = "mav0/cam0/sensor.yaml", "mav0/state_groundtruth_estimate0/data.csv"
 BAD = {
     "camera_model 'omni' is not read, only pinhole": (CAM, {"camera_model": "omni"}),
-    "distortion_model 'double-sphere' is none of radial-tangential": (CAM, {"distortion_model": "double-sphere"}),
+    "distortion_model 'double-sphere' is not one of radial-tangential": (CAM, {"distortion_model": "double-sphere"}),
     "has 2 distortion_coefficients, radial-tangential has 4": (CAM, {"distortion_coefficients": [0.1, 0.2]}),
     "'T_BS' must be 16 finite numbers": (CAM, {"T_BS": {"data": [1.0] * 12}}),
     "'intrinsics' must be 4 finite numbers": (CAM, {"intrinsics": "none"}),
     "T_BS: the pose's rotation is not orthonormal": (CAM, {"T_BS": {"data": [2.0, *[0.0] * 14, 1.0]}}),
-    "T_BS is no rotation and shift": (CAM, {"T_BS": {"data": [0.0] * 15 + [1.0]}}),
-    "sensor.yaml: is no YAML": (CAM, "a: [1"),
-    "sensor.yaml: is no YAML ": (CAM, "a: " + "9" * 5000),
-    "sensor.yaml: holds no calibration": (CAM, "- 1"),
+    "T_BS is not a rotation and shift": (CAM, {"T_BS": {"data": [0.0] * 15 + [1.0]}}),
+    "sensor.yaml: is not YAML": (CAM, "a: [1"),
+    "sensor.yaml: is not YAML ": (CAM, "a: " + "9" * 5000),
+    "sensor.yaml: contains no calibration": (CAM, "- 1"),
     "line 1: names the columns 'p_rs_r_x, p_rs_r_y, p_rs_r_z, q_rs_x": (
         TRUTH,
         HEADER.replace("q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []", "q_RS_x [], q_RS_y [], q_RS_z [], q_RS_w []"),
     ),
-    "line 2: is no row of a time stamp and 7 numbers": (TRUTH, HEADER + "\n1,2,3"),
+    "line 2: is not a row of a time stamp and 7 numbers": (TRUTH, HEADER + "\n1,2,3"),
     "has no pose": (TRUTH, HEADER),
     "none of 1 poses": (TRUTH, HEADER + "\n1403636000000000000,0,0,0,1,0,0,0"),
-    "line 2: is no row 'timestamp, filename'": ("mav0/cam0/data.csv", "#t\na.png"),
-    "names '../../x.png', which is no file inside": ("mav0/cam0/data.csv", f"{FIRST_NS},../../x.png"),
+    "line 2: is not a row 'timestamp, filename'": ("mav0/cam0/data.csv", "#t\na.png"),
+    "names '../../x.png', which is not a file inside": ("mav0/cam0/data.csv", f"{FIRST_NS},../../x.png"),
 }
 
 

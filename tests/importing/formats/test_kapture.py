@@ -101,7 +101,7 @@ def test_a_sensor_of_a_rig_is_where_the_rig_says(walk, cam_from_world, tmp_path)
 
 @pytest.mark.parametrize("is_rigged", [False, True])
 def test_kapture_itself_reads_the_same(walk, cam_from_world, tmp_path, is_rigged):
-    """Needs kapture (pip install kapture==1.1.12), which is no extra of this project: it brings numba."""
+    """Needs kapture (pip install kapture==1.1.12), which is not an extra of this project: it brings numba."""
     kapture = pytest.importorskip("kapture")
     csv = pytest.importorskip("kapture.io.csv")
     folder = tmp_path / "room"
@@ -180,11 +180,11 @@ BAD = [
     ("sensors.txt", "PINHOLE, 320", "FOV, 320", "camera model 'FOV' is not read, only SIMPLE_PINHOLE"),
     ("sensors.txt", "PINHOLE, 320", "OPENCV, 320", "sensors.txt, line 3: OPENCV must have 10 finite numbers"),
     ("sensors.txt", "PINHOLE, 320", "PINHOLE, 0", "sensors.txt, line 3: a camera must have a size"),
-    ("sensors.txt", "cam0,", "cam9,", "records_camera.txt, line 2: sensor 'cam0' is no camera of sensors.txt"),
-    ("records_camera.txt", "left/00000.png", "../00000.png", "names '../00000.png', which is no file inside of"),
-    ("records_camera.txt", ", cam0, left/00000.png", ", cam0", "line 2: is no row timestamp, sensor, image"),
+    ("sensors.txt", "cam0,", "cam9,", "records_camera.txt, line 2: sensor 'cam0' is not a camera of sensors.txt"),
+    ("records_camera.txt", "left/00000.png", "../00000.png", "names '../00000.png', which is not a file inside of"),
+    ("records_camera.txt", ", cam0, left/00000.png", ", cam0", "line 2: is not a row timestamp, sensor, image"),
     ("records_camera.txt", f"{FIRST}, ", "noon, ", "line 2: time stamp 'noon' is no whole number"),
-    ("trajectories.txt", f"{FIRST}, cam0, ", f"{FIRST}, cam0, x", "line 2: is no quaternion and translation"),
+    ("trajectories.txt", f"{FIRST}, cam0, ", f"{FIRST}, cam0, x", "line 2: is not a quaternion and translation"),
 ]
 
 

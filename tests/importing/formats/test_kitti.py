@@ -107,7 +107,7 @@ def test_several_sequences_are_several_worlds(kitti, refused):
 @pytest.mark.parametrize(
     ("file", "content", "says"),
     [
-        ("poses/07.txt", "1 0 0 0 0 1 0 0 0 0 1\n", "07.txt, line 1: is no line"),
+        ("poses/07.txt", "1 0 0 0 0 1 0 0 0 0 1\n", "07.txt, line 1: is not a line"),
         ("poses/07.txt", "1 0 0 0 0 2 0 0 0 0 1 0\n", "07.txt, line 1: the pose's rotation is not orthonormal"),
         ("poses/07.txt", "1 0 0 0 0 1 0 0 0 0 -1 0\n", "07.txt, line 1: the pose's rotation is not orthonormal"),
         ("poses/07.txt", "", "07.txt: is empty"),
@@ -115,7 +115,7 @@ def test_several_sequences_are_several_worlds(kitti, refused):
         ("sequences/07/calib.txt", None, "calib.txt: missing"),
         ("sequences/07/calib.txt", "P0: 1 2 3\n", "calib.txt: has no line 'P2:' of 12 finite numbers"),
         ("sequences/07/calib.txt", "P2: 1 2 3\n", "calib.txt: has no line 'P2:' of 12 finite numbers"),
-        ("sequences/07/calib.txt", f"P2: {'1 ' * 12}\n", "is no projection K [I | t]"),
+        ("sequences/07/calib.txt", f"P2: {'1 ' * 12}\n", "is not a projection K [I | t]"),
         (
             "sequences/07/calib.txt",
             "P2: 9 0 600 0 0 9 24 0 0 0 1 0\n",
@@ -125,7 +125,7 @@ def test_several_sequences_are_several_worlds(kitti, refused):
         ("sequences/07/calib.txt", "P2: 1e-300 0 32 1e300 0 9 24 0 0 0 1 0\n", "is more than 10 m from camera 0"),
         ("sequences/07/calib.txt", "P2: inf 0 32 0 0 9 24 0 0 0 1 0\n", "has no line 'P2:' of 12 finite numbers"),
         ("sequences/07/times.txt", "0\n1\n", "times.txt: has 2 times for 6 poses"),
-        ("sequences/07/times.txt", "0\n1 2\n", "times.txt, line 2: is no line 'seconds'"),
+        ("sequences/07/times.txt", "0\n1 2\n", "times.txt, line 2: is not a line 'seconds'"),
         ("sequences/07/image_2/000000.png", "no image", "000000.png: image cannot be decoded"),
     ],
 )

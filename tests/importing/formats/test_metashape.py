@@ -157,7 +157,7 @@ def test_disabled_and_unaligned_cameras_are_left_out(write, walk, tmp_path):
     assert [image.stem for image in capture.images] == [f"DJI_{row:04d}" for row in (0, 1, 2, 3, 7)]
     rules = {image.split("/")[-1]: rule for image, rule in capture.left_out.items()}
     assert rules["DJI_0004.png"] == "disabled in Metashape"
-    assert "transform is no 4x4 matrix" in rules["DJI_0008.png"]
+    assert "transform is not a 4x4 matrix" in rules["DJI_0008.png"]
     assert capture.poses_without_image == ("DJI_0999",)
     assert {image.stem for image in capture.images_without_pose} >= {"DJI_0005", "DJI_0006"}
     assert capture.choices["not read"] == "1 cameras of other components, which were aligned apart"
@@ -165,15 +165,15 @@ def test_disabled_and_unaligned_cameras_are_left_out(write, walk, tmp_path):
 
 CAMERAS = camera("DJI_0001", np.eye(4)) + camera("DJI_0002", np.eye(4))
 BAD = {
-    "is no XML": "<document><chunk>",
+    "is not XML": "<document><chunk>",
     "declares a document type, which may hold entities": '<!DOCTYPE a [<!ENTITY b "c">]><document><chunk/></document>',
     "no camera is aligned": document(sensor(f=300.0), camera("DJI_0001"), ""),
     "sensor 0: has no calibration": document("", CAMERAS, ""),
     "sensor 0: is 'spherical', not a frame or fisheye": document(sensor(kind="spherical", f=300.0), CAMERAS, ""),
-    "sensor 0: k1 is no number": document(sensor(f=300.0, k1="wide"), CAMERAS, ""),
+    "sensor 0: k1 is not a number": document(sensor(f=300.0, k1="wide"), CAMERAS, ""),
     "sensor 0: a camera must have a size and finite, positive focal lengths": document(sensor(cx=1.0), CAMERAS, ""),
     "sensor 0: principal point 9160, 120 is far": document(sensor(f=300.0, cx=9000.0), CAMERAS, ""),
-    "the chunk's transform is no rotation, translation and scale": document(
+    "the chunk's transform is not a rotation, translation and scale": document(
         sensor(f=300.0), CAMERAS, chunk_transform(scale=0.0)
     ),
     "the chunk's transform: the pose's rotation is not orthonormal": document(
@@ -181,7 +181,7 @@ BAD = {
     ),
     "the chunk's transform has no rotation": document(sensor(f=300.0), CAMERAS, chunk_transform(np.zeros((3, 3)))),
     "more than one pose": document(sensor(f=300.0), 2 * camera("DJI_0001", np.eye(4)), ""),
-    "names '../../etc/passwd', which is no file inside": document(
+    "names '../../etc/passwd', which is not a file inside": document(
         sensor(f=300.0), camera("../../etc/passwd", np.eye(4)), ""
     ),
 }

@@ -275,16 +275,18 @@ def without(told, *keys):
 
 
 BAD = {
-    "is no JSON": lambda told: "{",
-    "is no JSON ": lambda told: "[" * 100_000,
+    "is not JSON": lambda told: "{",
+    "is not JSON ": lambda told: "[" * 100_000,
     "has no list of 'frames'": lambda told: {},
-    "is no JSON object; it holds 'frames'": lambda told: [],
+    "is not a JSON object; it holds 'frames'": lambda told: [],
     "has no list of 'frames' ": top(frames=[1]),
-    "frame 1: file_path: names 'None', which is no file inside of": frame("file_path", None),
-    "frame 1: file_path: names '../../secret.png', which is no file inside of": frame("file_path", "../../secret.png"),
-    "frame 1: file_path: names '/etc/passwd', which is no file inside of": frame("file_path", "/etc/passwd"),
-    "frame 1: file_path: names 'C:\\\\a.png', which is no file inside of": frame("file_path", "C:\\a.png"),
-    "aaaaaa', which is no file inside of": frame("file_path", "a" * 253),  # too long with a suffix
+    "frame 1: file_path: names 'None', which is not a file inside of": frame("file_path", None),
+    "frame 1: file_path: names '../../secret.png', which is not a file inside of": frame(
+        "file_path", "../../secret.png"
+    ),
+    "frame 1: file_path: names '/etc/passwd', which is not a file inside of": frame("file_path", "/etc/passwd"),
+    "frame 1: file_path: names 'C:\\\\a.png', which is not a file inside of": frame("file_path", "C:\\a.png"),
+    "aaaaaa', which is not a file inside of": frame("file_path", "a" * 253),  # too long with a suffix
     "images/a_2.png more than one pose; remove all but one": frame("file_path", "images/a_2.png"),
     "tells a focal length of some frames, not of": lambda told: frame("fl_x", 30.0)(without(told, "fl_x")),
     "camera of a_1.png: fl_x is 'wide', no finite number": frame("fl_x", "wide"),
@@ -298,16 +300,16 @@ BAD = {
     "camera_model 'EQUIRECTANGULAR' is not read": frame("camera_model", "EQUIRECTANGULAR"),
     "k4 is 0.1, which OpenCV's lens has not": frame("k4", 0.1),
     "applied_scale is 0": top(applied_scale=0),
-    "applied_transform is no rotation and shift": top(applied_transform=[[2, 0, 0, 0]] * 3),
-    "applied_transform is no 4x4": top(applied_transform="z up"),
-    "train_filenames is no list": top(train_filenames=3),
+    "applied_transform is not a rotation and shift": top(applied_transform=[[2, 0, 0, 0]] * 3),
+    "applied_transform is not a 4x4": top(applied_transform="z up"),
+    "train_filenames is not a list": top(train_filenames=3),
 }
 
 
 MALFORMED = {
-    "frame 1: transform_matrix is no 4x4 or 3x4 matrix": [[1, 2], [3, 4]],
-    "frame 1: transform_matrix is no 4x4 or 3x4 matrix ": "none",
-    "frame 1: transform_matrix is no 4x4 or 3x4 matrix  ": [["a"] * 4] * 4,
+    "frame 1: transform_matrix is not a 4x4 or 3x4 matrix": [[1, 2], [3, 4]],
+    "frame 1: transform_matrix is not a 4x4 or 3x4 matrix ": "none",
+    "frame 1: transform_matrix is not a 4x4 or 3x4 matrix  ": [["a"] * 4] * 4,
     "frame 1: transform_matrix's last row is not 0 0 0 1": [[1, 0, 0, 0]] * 4,
 }
 
@@ -369,5 +371,5 @@ def test_a_folder_of_something_else(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(InputError, match="looks like no format that is known"):
         read_capture(tmp_path)
-    with pytest.raises(InputError, match=r"holds none of transforms\.json"):
+    with pytest.raises(InputError, match=r"contains none of transforms\.json"):
         read_capture(tmp_path, "nerfstudio")

@@ -115,11 +115,11 @@ def test_a_position_that_is_none_has_no_pose(write):
 
 
 BAD = {
-    "line 2: is no row of a name and numbers": "IMG_0000.png,0,0,0,0,90,0",
-    "line 2: is no row of a name and numbers ": "IMG_0000.png,0,0,0,north,90,0,30",
+    "line 2: is not a row of a name and numbers": "IMG_0000.png,0,0,0,0,90,0",
+    "line 2: is not a row of a name and numbers ": "IMG_0000.png,0,0,0,north,90,0,30",
     "has no row below its columns' names": "",
     "line 2: a camera must have a size and finite, positive focal lengths": "IMG_0000.png,0,0,0,0,90,0,-30",
-    "names '../a.png', which is no file inside": "../a.png,0,0,0,0,90,0,30",
+    "names '../a.png', which is not a file inside": "../a.png,0,0,0,0,90,0,30",
     "IMG_0000.png more than one pose": "IMG_0000.png,0,0,0,0,90,0,30\nIMG_0000.png,1,0,0,0,90,0,30",
 }
 

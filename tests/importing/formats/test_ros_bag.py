@@ -265,4 +265,4 @@ def test_topics_are_of_bags_alone(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         tool(tmp_path, "--out", tmp_path / "scene", "--topic", "/eye")
     assert ended.value.code == 2
-    assert "is no ROS bag but structure_from_motion" in capsys.readouterr().err
+    assert "is not a ROS bag but structure_from_motion" in capsys.readouterr().err

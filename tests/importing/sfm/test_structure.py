@@ -149,7 +149,7 @@ def test_a_few_photographs_are_posed_alike_twice(walk, tmp_path):
     for number in chosen:
         cv2.imwrite(str(tmp_path / f"{number}.jpg"), pictures[number][..., ::-1])
     first = read_structure(tmp_path)
-    assert first.choices["frames"] == f"all {len(chosen)} photographs"
+    assert first.choices["frames"] == f"all {len(chosen)} photos"
     assert first.time_s is None
     rows = [list(chosen)[int(image.stem)] for image in first.images]
     position_m, rotation_deg, extent_m = errors(first, poses[rows])

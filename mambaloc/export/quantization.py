@@ -38,7 +38,7 @@ class EightBit:
         model: the network.
         kind: ``all layers``, or ``mixed``: the first layer, the heads and squeeze-excitation's gates in float32.
         position_error_m: median over the test frames.
-        rotation_error_deg: likewise.
+        rotation_error_deg: median rotation error on the same frames.
         loss: by how much of itself the median error grew, the larger of position's and rotation's.
         frames: test frames that this was measured, and decided, on.
     """
@@ -89,7 +89,7 @@ def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> EightBit:
 
 
 def median_errors(model: onnx.ModelProto, data: PoseDataModule) -> dict[str, float]:
-    """Errors of a network in ONNX Runtime over the test frames, as :func:`mambaloc.metrics.summarise` tells them."""
+    """Errors of a network in ONNX Runtime over the test frames, as :func:`mambaloc.metrics.summarize` returns them."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])

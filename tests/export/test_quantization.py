@@ -12,7 +12,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.export import contract_of, export_onnx, quantisation, write_bundle
-from mambaloc.export.quantisation import eight_bit, median_errors, sensitive_nodes
+from mambaloc.export.quantization import eight_bit, median_errors, sensitive_nodes
 from mambaloc.metrics import summarize
 from mambaloc.models.student import LitStudent
 

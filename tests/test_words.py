@@ -1,0 +1,154 @@
+"""Plain words: messages, helps, docstrings and pages use the field's terms, and identifiers American spelling.
+
+The list and the reasons are in CONTRIBUTING, "How we write"; docs/wording.md has examples.
+"""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted(path for folder in ("mambaloc", "tools") for path in (ROOT / folder).rglob("*.py"))
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLES = {"wording.md"}  # quotes the words that it replaces
+
+INSTEAD = {
+    r"told": "given, known, recorded",
+    r"tells?|telling": "show, state, distinguish, estimate",
+    r"said": "stated, given; message",
+    r"anew": "again",
+    r"likewise": "also, the same, or repeat what is meant",
+    r"(?:is|are|be) (?-i:none)": "does not exist, is not one; or a sentence with 'no'",
+    # "most of them" is plain English; "what was left out of them" leaves the noun out.
+    r"(?!(?:one|two|all|some|half|none|each|many|most|several|both|any|more|few|first|part|which)\b)[a-z]+ of them": (
+        "repeat the noun"
+    ),
+    r"(?<!there )(?:is|are|was|were|be) no (?!longer|more|less|\w+er\b|worse)\w+": "is not a",
+    r"holds? no|holds? none": "has no, contains no",
+    r"pictures?|photographs?": "image",
+    r"(?:an?|the|of|this|each|every|any|or|and|no|one|in|with) films?|films": "video",
+    r"lacks?|lacking": "has no, is missing",
+    r"nobody": "no one, nothing; or name who",
+    r"mend|mends|mended": "repair, correct",
+    r"errs?": "is wrong, has an error",
+    r"(?<!or )no whole": "truncated, damaged",
+    r"for want of": "without",
+}
+WORDS = {word: re.compile(rf"\b(?:{word})\b", re.IGNORECASE) for word in INSTEAD}
+ANY = re.compile("|".join(rf"\b(?:{word})\b" for word in INSTEAD), re.IGNORECASE)
+CODE = re.compile(r"``.*?``|`[^`]*`|data\.\w+(?: to|:) \w+|^ +\w+: ", re.DOTALL | re.MULTILINE)
+"""What is not prose: code, an option with its value, and the name that starts an argument's entry."""
+
+BRITISH = re.compile("localis|normalis|colour|centre|discretis|summaris|quantis|recognis", re.IGNORECASE)
+OLD_SPELLINGS = {
+    "discretisation": "a hyperparameter in recipes, checkpoints and manifests",
+    "normalise_position": "likewise",
+    "localise": "deprecated",
+    "localise_each": "deprecated",
+    "normalise": "deprecated",
+}
+
+
+def findings(text: str) -> list[str]:
+    """Each word of the list in a text, with what to write instead."""
+    prose = CODE.sub("", text)
+    if not ANY.search(prose):
+        return []
+    return [f"{found[0]!r}: write {INSTEAD[word]}" for word, rule in WORDS.items() for found in rule.finditer(prose)]
+
+
+def strings(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and text of string literals that are prose, without the fields of f-strings."""
+    nested = {
+        id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values
+    }  # an f-string's parts belong together
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            text = "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in nested:
+            text = node.value
+        else:
+            continue
+        if " " in text.strip():
+            yield node.lineno, text
+
+
+def prose_lines(page: str) -> Iterator[tuple[int, str]]:
+    """Number and text of a page's lines outside code blocks."""
+    is_code = False
+    for number, line in enumerate(page.splitlines(), start=1):
+        if line.lstrip().startswith("```"):
+            is_code = not is_code
+        elif not is_code:
+            yield number, line
+
+
+def identifiers(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Names of functions, classes and arguments, and what ``__all__`` lists."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.lineno, node.name
+        elif isinstance(node, ast.arg):
+            yield node.lineno, node.arg
+        elif isinstance(node, ast.Assign) and any(getattr(each, "id", "") == "__all__" for each in node.targets):
+            yield from ((node.lineno, name) for name in ast.literal_eval(node.value))
+
+
+def _reported(path: Path, number: int, found: list[str]) -> list[str]:
+    return [f"{path.relative_to(ROOT)}:{number}: {each}" for each in found]
+
+
+def test_messages_and_docstrings_use_plain_words():
+    found = [
+        line
+        for path in SOURCES
+        for number, text in strings(ast.parse(path.read_text(encoding="utf-8")))
+        for line in _reported(path, number, findings(text))
+    ]
+    assert not found, "\n" + "\n".join(found)
+
+
+def test_pages_use_plain_words():
+    found = []
+    for path in PAGES:
+        if path.name in EXAMPLES:
+            continue
+        for number, line in prose_lines(path.read_text(encoding="utf-8")):
+            found += _reported(path, number, findings(line))
+    assert not found, "\n" + "\n".join(found)
+
+
+def test_identifiers_are_american():
+    found = []
+    for path in SOURCES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        names = [(1, path.stem), *identifiers(tree)]
+        found += [
+            f"{path.relative_to(ROOT)}:{number}: {name}"
+            for number, name in names
+            if BRITISH.search(name) and name not in OLD_SPELLINGS
+        ]
+    assert not found, "\n" + "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("lacks seed; nothing is told without where it came from", ["told", "lacks"]),
+        ("is no mapping; publish the model anew", ["anew", "is no mapping"]),
+        ("there is no such model, and it is no longer needed", []),
+        ("``pictures`` is a key of the answer", []),
+        ("film slowly: a film of 35 mm", ["a film"]),
+        ("retold, saidst, unlikewise", []),
+    ],
+)
+def test_the_list_finds_words_and_leaves_plain_english(text, words):
+    assert [line.split(":")[0].strip("'") for line in findings(text)] == words
+
+
+def test_strings_are_found_where_they_are():
+    tree = ast.parse('def f(x):\n    """Say it."""\n    raise E(f"{x}: holds " f"no {x!r} of them")\nkey = "told"\n')
+    assert list(strings(tree)) == [(2, "Say it."), (3, "…: holds no … of them")]
