@@ -100,7 +100,10 @@ class RecipeCLI(LightningCLI):
         of_a_scene = inspect.signature(PoseDataModule).parameters.values()  # build_data hands them on without defaults
         parser.set_defaults({f"data.{each.name}": each.default for each in of_a_scene})
         parser.add_argument(
-            "--retrieval", type=bool, default=False, help="also measure retrieval on the backbone's first features"
+            "--retrieval",
+            type=bool,
+            default=False,
+            help="also measure image retrieval with the backbone's initial weights",
         )
         for shared in ("image_size", "scenes"):
             parser.link_arguments(f"data.{shared}", f"model.init_args.{shared}")
@@ -118,15 +121,17 @@ class RecipeCLI(LightningCLI):
         """Without validation no epoch is better than another; what only fails at the end is refused here."""
         config = self.config[self.subcommand]
         if config.get("retrieval") and not config.model.init_args.get("backbone_weights"):
-            raise InputError("retrieval: this backbone starts from scratch, and finds nothing; set it to false")
+            raise InputError(
+                "retrieval: needs a pretrained backbone. Set model.backbone_weights, or retrieval to false."
+            )
         if config.trainer.enable_checkpointing is False:
             raise InputError(
-                "trainer.enable_checkpointing false: a run ends with the errors of its checkpoints. Leave it out; "
-                "best_checkpoint.save_top_k 0 keeps the last one alone."
+                "trainer.enable_checkpointing false: a run ends by evaluating its checkpoints. Leave it out; "
+                "best_checkpoint.save_top_k 0 keeps only the last one."
             )
         if str(config.trainer.precision) in ("16-true", "bf16-true"):
             raise InputError(
-                f"trainer.precision {config.trainer.precision}: images and poses have 32 bits, so weights must. "
+                f"trainer.precision {config.trainer.precision}: images and poses are float32, so weights must be. "
                 f"Give {str(config.trainer.precision).replace('true', 'mixed')}."
             )
         if config.data.scenes and config.map.enabled:
@@ -172,7 +177,7 @@ class RecipeCLI(LightningCLI):
         except SystemExit:  # Lightning's answer to Ctrl-C
             last = run_dir / "checkpoints" / "last.ckpt"
             if last.is_file():
-                print(f"interrupted: go on with the same command and --ckpt_path {last}", file=sys.stderr)
+                print(f"interrupted: resume with the same command and --ckpt_path {last}", file=sys.stderr)
             raise
 
     def after_fit(self) -> None:

@@ -147,7 +147,10 @@ class LitDistillation(LitStudent):
         system = load(path)
         if system.image_size != self.image_size:
             sizes = " and ".join("x".join(map(str, s.image_size)) for s in (system, self))
-            raise InputError(f"model.teacher {path}: it and the student see {sizes} pixels; set data.image_size")
+            raise InputError(
+                f"model.teacher {path}: teacher and student have different image sizes, {sizes} pixels; set "
+                "data.image_size"
+            )
         self.teacher = Teacher(system)
         width = self.teacher(torch.zeros(1, 3, *self.image_size)).feature.shape[-1]
         self.distillation = DistillationTerms(hparams["width"], width, hparams["soft"], hparams["soft_args"])
@@ -215,6 +218,6 @@ class LitDistillation(LitStudent):
         super().on_load_checkpoint(checkpoint)
         if "distillation" not in checkpoint:
             raise InputError(
-                "--ckpt_path: it is a student's, not of a distillation; name it as model.warm_start instead"
+                "--ckpt_path: is a student's checkpoint, not a distillation's. Give it as model.warm_start."
             )
         checkpoint["state_dict"].update(checkpoint["distillation"])

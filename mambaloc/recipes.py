@@ -38,4 +38,4 @@ def recipe_path(recipe: str) -> Path:
     name = path.with_suffix("").as_posix().removeprefix("recipes/")
     if name in list_recipes():
         return next(found for folder in _FOLDERS if (found := folder / f"{name}.yaml").is_file())
-    raise InputError(f"{recipe}: there is no such recipe. {suggestion(name, list_recipes())}")
+    raise InputError(f"{recipe}: no such recipe. {suggestion(name, list_recipes())}")

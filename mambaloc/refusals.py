@@ -27,7 +27,7 @@ class OneLineErrorParser(LightningArgumentParser):
         if unknown and '"model' in said:
             systems = [model_class(name).__name__ for name in list_models()]
             closest = suggestion(unknown[1], systems)
-            raise InputError(f"model.class_path {unknown[1]}: there is no such class. {closest}")
+            raise InputError(f"model.class_path {unknown[1]}: no such class. {closest}")
         remedy = "; --help lists the options"  # a subcommand's parser reports to its parent, which reports again
         raise InputError(said.replace("typing.", "").removesuffix(remedy) + remedy)
 

@@ -206,12 +206,14 @@ def _together(scenes: list[ErrorsByDistance]) -> ErrorsByDistance:
 def _check_held_out(data: PoseDataModule, trained_on: str | None) -> None:
     validation = data.hparams["validation"]
     if validation in ("none", "test_set"):
-        raise InputError(f"data.validation {validation}: how sure a pose is needs held-out frames; train with auto")
+        raise InputError(
+            f"data.validation {validation}: calibrating the uncertainty needs held-out frames; train with auto"
+        )
     if trained_on is not None:  # else nothing need be decoded
         data.setup("fit")
     if trained_on is None or trained_on != data.describe()["fingerprints"]["train"]:
         raise InputError(
-            f"{data.folder}: the system was trained on other frames, or does not say on which, so that none is known "
+            f"{data.folder}: the system was trained on other or unknown frames, so no frame is known "
             "to be held out; give a checkpoint's own"
         )
     count, needed = len(data.frames("val")), math.ceil(LEVEL / (1 - LEVEL) - 1e-9)

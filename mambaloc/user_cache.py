@@ -69,7 +69,7 @@ def arrays_made_once(name: str, make: Callable[[], dict[str, NDArray[Any]]]) -> 
         with np.load(file) as arrays:
             return dict(arrays)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: is damaged ({error}). Remove {file.parent}, and it is made again.") from None
+        raise InputError(f"{file}: is damaged ({error}). Remove {file.parent} to have it made again.") from None
 
 
 def fingerprint(path: Path) -> bytes:

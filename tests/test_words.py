@@ -6,6 +6,7 @@ The list and the reasons are in CONTRIBUTING, "How we write"; docs/wording.md ha
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,8 @@ BRITISH = re.compile("localis|normalis|colour|centre|discretis|summaris|quantis|
 OLD_SPELLINGS = {
     "discretisation": "a hyperparameter in recipes, checkpoints and manifests",
     "normalise_position": "likewise",
+    "localiser": "a deprecated module",
+    "localisation": "a deprecated module",
     "localise": "deprecated",
     "localise_each": "deprecated",
     "normalise": "deprecated",
@@ -60,20 +63,25 @@ def findings(text: str) -> list[str]:
     return [f"{found[0]!r}: write {INSTEAD[word]}" for word, rule in WORDS.items() for found in rule.finditer(prose)]
 
 
-def strings(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Line and text of string literals that are prose, without the fields of f-strings."""
-    nested = {
-        id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values
-    }  # an f-string's parts belong together
-    for node in ast.walk(tree):
-        if isinstance(node, ast.JoinedStr):
-            text = "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in nested:
-            text = node.value
-        else:
-            continue
-        if " " in text.strip():
-            yield node.lineno, text
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """A source file, parsed once."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def strings(node: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and text of string literals that are prose; an f-string is one text, without its fields."""
+    if isinstance(node, ast.JoinedStr):
+        yield node.lineno, "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+        for part in node.values:
+            if isinstance(part, ast.FormattedValue):
+                yield from strings(part.value)
+    elif isinstance(node, ast.Constant):
+        if isinstance(node.value, str) and " " in node.value.strip():
+            yield node.lineno, node.value
+    else:
+        for child in ast.iter_child_nodes(node):
+            yield from strings(child)
 
 
 def prose_lines(page: str) -> Iterator[tuple[int, str]]:
@@ -105,7 +113,7 @@ def test_messages_and_docstrings_use_plain_words():
     found = [
         line
         for path in SOURCES
-        for number, text in strings(ast.parse(path.read_text(encoding="utf-8")))
+        for number, text in strings(tree_of(path))
         for line in _reported(path, number, findings(text))
     ]
     assert not found, "\n" + "\n".join(found)
@@ -124,8 +132,7 @@ def test_pages_use_plain_words():
 def test_identifiers_are_american():
     found = []
     for path in SOURCES:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        names = [(1, path.stem), *identifiers(tree)]
+        names = [(1, path.stem), *identifiers(tree_of(path))]
         found += [
             f"{path.relative_to(ROOT)}:{number}: {name}"
             for number, name in names

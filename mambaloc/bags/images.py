@@ -87,7 +87,7 @@ def image_topic(bag: Bag, asked: str | None = None) -> str:
     if asked is not None:
         if asked not in every:
             there = ", ".join(every) or "none"
-            raise InputError(f"--topic {asked}: {bag.path} this topic has no images. Topics of images: {there}.")
+            raise InputError(f"--topic {asked}: {bag.path} has no such topic of images. Choose one of {there}.")
         return asked
     if not every:
         raise InputError(f"{bag.path}: has no topic of images (Image or CompressedImage). Record the camera's.")
@@ -154,10 +154,10 @@ def images_of(bag: Bag, topic: str) -> Iterator[BagImage]:
         frame = named if frame is None else frame
         if named != frame:
             raise InputError(
-                f"{bag.path}: {topic} has images of the frames {frame!r} and {named!r}. Record a topic a camera."
+                f"{bag.path}: {topic} has images of the frames {frame!r} and {named!r}. Record one topic per camera."
             )
         if ns <= 0:
-            raise InputError(f"{bag.path}: {topic}, message {number}: its header has no time. Record with stamps.")
+            raise InputError(f"{bag.path}: {topic}, message {number}: its header has no time. Record with time stamps.")
         if hasattr(message, "format"):
             data = message.data.tobytes()
             yield BagImage(number, ns, frame, decode_image(data, upright=False), data)

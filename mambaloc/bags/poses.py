@@ -96,7 +96,7 @@ def _link(bag: Bag, topic: str, camera: str, of: str | None) -> Link:
         child = said or of
         if not child:
             raise InputError(
-                f"{bag.path}: {topic} does not say which frame's poses it has. Name it with --pose-frame: {camera} if "
+                f"{bag.path}: {topic} does not name the frame of its poses. Name it with --pose-frame: {camera} if "
                 "they are the camera's (z forward), or the robot's, such as base_link."
             )
         link = link or Link(parent, child)

@@ -40,7 +40,7 @@ def pose_bag(out: Path, world: str) -> Iterator[WritePose]:
     from rosbags.typesys import Stores, get_typestore
 
     if out.exists():
-        raise InputError(f"--out {out}: is there already, and no bag is overwritten. Remove it, or choose another.")
+        raise InputError(f"--out {out}: already exists. Remove it, or choose another --out.")
     is_1 = out.suffix == ".bag"
     types: Any = get_typestore(Stores.ROS1_NOETIC if is_1 else Stores.ROS2_HUMBLE)
     serialize = types.serialize_ros1 if is_1 else types.serialize_cdr

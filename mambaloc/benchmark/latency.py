@@ -66,7 +66,7 @@ def measure_latency(
         raise InputError(f"--repetitions {repetitions}: quartiles need 4 or more")
     visible = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
     if device not in visible:
-        raise InputError(f"--device {device}: not here; choose one of {', '.join(visible)}")
+        raise InputError(f"--device {device}: not available; choose one of {', '.join(visible)}")
     cells = [(name, batch) for name in systems for batch in batches]
     console = Console(stderr=True)
     found: list[Latency] = []

@@ -40,7 +40,7 @@ class Setting:
         """
         said = read_yaml(path, "see recipes/overlays/", "give an overlay, as recipes/overlays/ holds them")
         if not isinstance(said, dict) or not set(said) & {"model", "data", "trainer"}:
-            raise InputError(f"{path}: says nothing of model, data or trainer; give one of recipes/overlays/")
+            raise InputError(f"{path}: sets nothing of model, data or trainer; give one of recipes/overlays/")
         model = _section(path, said, "model")
         return replace(
             self,

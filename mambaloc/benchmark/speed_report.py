@@ -74,7 +74,7 @@ def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> N
         InputError: for numbers that cannot be measured on this scene.
     """
     if len(frames) == 1:
-        raise InputError(f"--frames {frames[0]}: how cost grows takes two numbers or more")
+        raise InputError(f"--frames {frames[0]}: needs at least two values to fit a scaling exponent")
     if sought_m is not None:
         check_whole_training(setting)
     data = setting.build()[1]

@@ -35,7 +35,7 @@ def main() -> None:
         print(_USAGE.format("\n".join(f"  {each:<10} {does}" for each, (_, does) in _MODULES.items())))
         return
     if name not in _MODULES:
-        print(f"error: mambaloc {name}: there is no such command. {suggestion(name, _MODULES)}", file=sys.stderr)
+        print(f"error: mambaloc {name}: no such command. {suggestion(name, _MODULES)}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [f"mambaloc {name}", *words]
     import_module(f"{__name__}.{_MODULES[name][0]}").main()

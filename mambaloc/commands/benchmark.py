@@ -16,25 +16,29 @@ def main() -> None:
     quieten()
     parser = OptionParser(description=__doc__)
     parts = parser.add_subparsers(required=True)
-    part = parts.add_parser("sizes", help="parameters of every system beside the paper's")
+    part = parts.add_parser("sizes", help="parameter counts of every system, compared with the paper's")
     part.set_defaults(call=lambda args: benchmark.print_sizes(benchmark.size_table()))
     part = parts.add_parser("latency", help="forward and training-step times with GIS, as ratios to without")
-    part.add_argument("systems", nargs="*", help="names; all by default")
+    part.add_argument("systems", nargs="*", help="names of systems (default: all)")
     part.add_argument("--image-size", type=whole_number(32), default=224)
     part.add_argument("--repetitions", type=whole_number(2), default=20)
     part.add_argument("--device", default="cpu", help="cpu or cuda")
     part.set_defaults(call=_latency)
     part = parts.add_parser("deployment", help="size, latency, errors of trained systems in every precision")
-    part.add_argument("sources", nargs="+", help="checkpoints, zoo names; the first is what others are compared with")
+    part.add_argument("sources", nargs="+", help="checkpoints or released models, compared with the first")
     part.add_argument("--threads", type=thread_count, default=2)
     part.add_argument("--repetitions", type=whole_number(2), default=50)
     part.set_defaults(call=_deployment)
-    part = parts.add_parser("speed", help="seconds and memory of training steps, beside published programs")
+    part = parts.add_parser("speed", help="seconds and memory of training steps, compared with published programs")
     part.add_argument("system", nargs="?", default="mambaloc")
-    part.add_argument("--overlay", type=Path, action="append", default=[], help="as recipes/overlays/ holds them")
+    part.add_argument(
+        "--overlay", type=Path, action="append", default=[], help="an overlay such as those in recipes/overlays/"
+    )
     for name, default in (("--dataset", "embedded"), ("--root", None), ("--scene", "heads")):
         part.add_argument(name, default=default)
-    part.add_argument("--batch", type=whole_number(1), nargs="*", default=[], help="images a step; as published")
+    part.add_argument(
+        "--batch", type=whole_number(1), nargs="*", default=[], help="images per step (default: as published)"
+    )
     part.add_argument("--frames", type=whole_number(2), nargs="*", default=[], help="of an epoch")
     part.add_argument("--steps", type=whole_number(1), default=3, help="of a turn")
     part.add_argument("--turns", type=whole_number(1), default=3, help="of each program, a process each")
@@ -60,7 +64,7 @@ def _deployment(args: argparse.Namespace) -> None:
 
 def _speed(args: argparse.Namespace) -> None:
     if args.out and not args.out.parent.is_dir():
-        raise InputError(f"{args.out}: there is no folder {args.out.parent}; make it first")
+        raise InputError(f"{args.out}: the folder {args.out.parent} does not exist; make it first")
     scene = {"dataset": args.dataset, "root": args.root, "scene": args.scene, "validation": "block"}
     system = model_class(args.system).registry_name
     setting = benchmark.Setting(system, data={**benchmark.PUBLISHED_DATA.get(system, {}), **scene})

@@ -11,13 +11,19 @@ def main() -> None:
     """Serve the page until Ctrl-C, or write it."""
     quieten()
     parser = OptionParser(description=__doc__)
-    parser.add_argument("bundle", nargs="?", type=Path, help="of mambaloc export; the embedded room's by default")
-    parser.add_argument("--port", type=whole_number(0, 65535), default=8000, help="0 takes a free one")
+    parser.add_argument(
+        "bundle", nargs="?", type=Path, help="a bundle of mambaloc export (default: the embedded room's)"
+    )
+    parser.add_argument("--port", type=whole_number(0, 65535), default=8000, help="0 chooses a free port")
     parser.add_argument("--lan", action="store_true", help="serve the local network by HTTPS, for a phone's camera")
     parser.add_argument(
-        "--video", "--film", type=Path, metavar="FILE", help="for the page to play; --film is its old name"
+        "--video",
+        "--film",
+        type=Path,
+        metavar="FILE",
+        help="a video for the page to play (--film until the next release)",
     )
-    parser.add_argument("--out", type=Path, help="write the page there, for any web server, and end")
+    parser.add_argument("--out", type=Path, help="write the page to this folder, for any web server, and exit")
     args = parser.parse_args()
     bundle = args.bundle or _released_bundle()
     video = args.video or (None if args.bundle else embedded_video())

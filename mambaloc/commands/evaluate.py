@@ -27,21 +27,19 @@ def main(argv: list[str] | None = None) -> None:
     quieten()
     parser = OneLineErrorParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("--out", type=Path, help="folder of the result; beside the checkpoint unless given")
-    parser.add_argument("--accelerator", default="auto", help="as Lightning's Trainer takes it")
+    parser.add_argument("--out", type=Path, help="folder for the results (default: next to the checkpoint)")
+    parser.add_argument("--accelerator", default="auto", help="an accelerator of Lightning's Trainer")
     parser.add_argument(
-        "--retrieval", action="store_true", help="also measure retrieval on the backbone's first features"
+        "--retrieval", action="store_true", help="also measure image retrieval with the backbone's initial weights"
     )
-    parser.add_argument(
-        "--map", type=Path, metavar="FILE", help="measure it beside the network; the run's unless given"
-    )
+    parser.add_argument("--map", type=Path, metavar="FILE", help="also measure this map (default: the run's)")
     parser.add_argument(
         "--rerun", type=Path, metavar="FILE.rrd", help="also record frames and poses for Rerun's viewer"
     )
     parser.add_function_arguments(build_data, "data")
     path = parser.parse_args(argv, defaults=False).checkpoint
     if path is None:
-        raise InputError("evaluate.py needs a checkpoint: evaluate.py RUN/checkpoints/best.ckpt")
+        raise InputError("a checkpoint is missing: mambaloc evaluate RUN/checkpoints/best.ckpt")
     checkpoint = Checkpoint.read(path)
     parser.set_defaults({f"data.{name}": value for name, value in checkpoint.data().hparams.items()})
     args = parser.parse_args(argv)
@@ -53,7 +51,7 @@ def main(argv: list[str] | None = None) -> None:
             if given := args[option]:
                 raise InputError(f"--{option} {given}: is of one scene, and this network knows several. Leave it out.")
         print_scenes(evaluate_scenes(checkpoint, out, data, args.accelerator, args.retrieval))
-        print(f"{out}: a folder a scene, each with metrics.json, predictions.csv, predictions.tum, trajectory.png")
+        print(f"{out}: a folder per scene, each with metrics.json, predictions.csv, predictions.tum, trajectory.png")
         return
     beside = measure_map(args.map, data) if args.map else measure_map_of_run(run, data)
     measured = evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval, beside, args.rerun)

@@ -17,15 +17,15 @@ def main() -> None:
     parser = OptionParser(description=__doc__)
     parser.add_argument("source", metavar="CHECKPOINT_OR_ZOO_NAME", help="RUN/checkpoints/best.ckpt, or ARCH.TAG")
     parser.add_argument("--to", default="onnx,fp16", help=f"of {', '.join(FORMATS)}, with commas")
-    parser.add_argument("--target", default="android", choices=TARGETS, help="kind of app that INTEGRATION.md is about")
+    parser.add_argument("--target", default="android", choices=TARGETS, help="kind of app that INTEGRATION.md is for")
     parser.add_argument(
         "--raw-input", action=BooleanOptionalAction, default=True, help="resize, crop and scale inside the models"
     )
     maps = parser.add_mutually_exclusive_group()
-    maps.add_argument("--map", type=Path, metavar="FILE", help="to ship beside the models; the run's unless given")
+    maps.add_argument("--map", type=Path, metavar="FILE", help="map to ship with the models (default: the run's)")
     maps.add_argument("--no-map", action="store_true", help="leave it out")
-    parser.add_argument("--root", help="folder that holds the scene; as in training unless given")
-    parser.add_argument("--out", type=Path, help="folder of the bundle; RUN/bundle or bundles/ZOO_NAME unless given")
+    parser.add_argument("--root", help="folder of the scene (default: as in training)")
+    parser.add_argument("--out", type=Path, help="folder of the bundle (default: RUN/bundle or bundles/ZOO_NAME)")
     args = parser.parse_args()
     formats = tuple(dict.fromkeys(word.strip() for word in args.to.split(",")))
     if unknown := sorted(map(repr, set(formats) - set(FORMATS))):

@@ -11,7 +11,7 @@ def main() -> None:
     """Write it, and say how many frames each split has."""
     parser = OptionParser(description=__doc__)
     parser.add_argument("scene", type=Path, help="folder that mambaloc import made")
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="the folder to make")
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="the folder to create")
     args = parser.parse_args()
     counts, unused = write_kapture(args.scene, args.out)
     for name, count in counts.items():

@@ -20,15 +20,19 @@ def main() -> None:
         description=__doc__, epilog="; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
     )
     parser.add_argument("source", type=Path, help="the capture: a folder, or the file that lists its poses")
-    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the folder to make")
-    parser.add_argument("--format", metavar="KIND", help=f"of {', '.join(FORMATS)}; found out unless given")
-    parser.add_argument("--images", type=Path, metavar="FOLDER", help="the capture's images, where they lie elsewhere")
-    parser.add_argument("--topic", metavar="NAME", help="of a ROS bag's images, where it has several")
-    parser.add_argument("--pose-topic", metavar="NAME", help="of a ROS bag's poses, or /tf, where it has several")
-    parser.add_argument("--pose-frame", metavar="FRAME", help="that a ROS bag's poses are of, where they do not say it")
-    parser.add_argument("--metres-per-unit", type=float, metavar="X", help="the capture's unit, where it is known")
+    parser.add_argument("--out", type=Path, required=True, metavar="SCENE", help="the folder to create")
+    parser.add_argument("--format", metavar="KIND", help=f"of {', '.join(FORMATS)}; detected by default")
     parser.add_argument(
-        "--split", default="auto", choices=ASKED, help="what to test on; the measured best unless given"
+        "--images", type=Path, metavar="FOLDER", help="folder of the capture's images, if they are elsewhere"
+    )
+    parser.add_argument("--topic", metavar="NAME", help="topic of a ROS bag's images, if it has several")
+    parser.add_argument("--pose-topic", metavar="NAME", help="topic of a ROS bag's poses, or /tf, if it has several")
+    parser.add_argument("--pose-frame", metavar="FRAME", help="frame of a ROS bag's poses, if they do not name it")
+    parser.add_argument(
+        "--metres-per-unit", type=float, metavar="X", help="the capture's unit in metres, if it is known"
+    )
+    parser.add_argument(
+        "--split", default="auto", choices=ASKED, help="how to choose test frames (default: the best measured split)"
     )
     parser.add_argument("--adjust-poses", action="store_true", help="also write poses that fit the images better")
     args = parser.parse_args()

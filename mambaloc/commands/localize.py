@@ -29,7 +29,7 @@ def main() -> None:
         "model",
         nargs="?",
         metavar="MODEL|MAP",
-        help="bundle, exported model, map.safetensors or ARCH.TAG; unless given, the embedded room's",
+        help="bundle, exported model, map.safetensors or ARCH.TAG (default: the embedded room's)",
     )
     parser.add_argument(
         "source", help="a video, an image, a folder of images (30 a second), a camera's number, or a ROS bag"
@@ -38,15 +38,17 @@ def main() -> None:
         "--out",
         type=Path,
         default=Path("poses.tum"),
-        help="trajectory to write, TUM format; of a ROS bag, another bag: FILE.bag of ROS 1, or a folder of ROS 2",
+        help="trajectory to write in TUM format; for a ROS bag another bag: FILE.bag for ROS 1, or a folder for ROS 2",
     )
-    parser.add_argument("--filter", choices=FILTERS, help="steady a video's poses: from those before, or from all")
+    parser.add_argument(
+        "--filter", choices=FILTERS, help="filter a video's poses: causal by earlier frames, smooth by all"
+    )
     cameras = parser.add_mutually_exclusive_group()
     cameras.add_argument(
         "--intrinsics",
         type=pinhole_matrix,
         metavar="FX,FY,CX,CY",
-        help="of the frames, in pixels; the training camera's unless given",
+        help="of the frames, in pixels (default: the training camera's)",
     )
     cameras.add_argument(
         "--distorted",
@@ -61,16 +63,20 @@ def main() -> None:
     )
     maps = parser.add_mutually_exclusive_group()
     maps.add_argument(
-        "--map", dest="sparse_map", default=True, metavar="FILE", help="beside the model; a bundle's own unless given"
+        "--map",
+        dest="sparse_map",
+        default=True,
+        metavar="FILE",
+        help="map to use with the model (default: the bundle's)",
     )
-    maps.add_argument("--no-map", dest="sparse_map", action="store_false", help="let the network answer alone")
-    parser.add_argument("--topic", metavar="NAME", help="of a bag's images, where it has several")
-    parser.add_argument("--world-frame", metavar="FRAME", help="that a bag's poses are in; map unless given")
-    parser.add_argument("--pose-frame", metavar="FRAME", help="that a bag's poses are of; the camera's unless given")
+    maps.add_argument("--no-map", dest="sparse_map", action="store_false", help="use the network alone")
+    parser.add_argument("--topic", metavar="NAME", help="topic of a bag's images, if it has several")
+    parser.add_argument("--world-frame", metavar="FRAME", help="frame that a bag's poses are in (default: map)")
+    parser.add_argument("--pose-frame", metavar="FRAME", help="frame that a bag's poses are of (default: the camera's)")
     parser.add_argument(
         "--rerun", type=Path, metavar="FILE.rrd", help="also record frames and poses for Rerun's viewer"
     )
-    parser.add_argument("--threads", type=thread_count, help="that the network may use for one image")
+    parser.add_argument("--threads", type=thread_count, help="threads that the network may use for an image")
     args = parser.parse_args()
     localizer = Localizer(_model(args.model), args.threads, args.sparse_map)
     if not is_bag(Path(args.source)) and (args.topic or args.world_frame or args.pose_frame):
@@ -123,9 +129,11 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
     from mambaloc.importing.formats.ros_bag import straightener
 
     if args.distorted:
-        raise InputError("--distorted: a bag says how its camera distorts, in CameraInfo. Leave it out.")
+        raise InputError("--distorted: a bag has its camera's distortion in CameraInfo. Leave it out.")
     if args.filter is not None:
-        raise InputError(f"--filter {args.filter}: a bag's poses are for a robot's own filter, as found. Leave it out.")
+        raise InputError(
+            f"--filter {args.filter}: a bag's poses are not filtered, since a robot has its own filter. Leave it out."
+        )
     if args.out.suffix == ".tum":
         raise InputError(f"--out {args.out}: a bag's poses go into a bag. Give --out FILE.bag, or a folder for ROS 2.")
 

@@ -36,7 +36,7 @@ def main(argv: list[str] | None = None) -> None:
     of_added = {"name": args.name, "intrinsics": args.intrinsics is not None, "distorted": args.distorted}
     if not args.add and any(of_added.values()):
         name = next(name for name, is_given in of_added.items() if is_given)
-        raise InputError(f"--{name}: is of what --add adds. Leave it out.")
+        raise InputError(f"--{name}: applies to --add alone. Leave it out.")
     if args.source.suffix == Path(MAP_FILE).suffix or (args.source / MAP_FILE).is_file():
         _change(args)
     else:
@@ -54,7 +54,7 @@ def _build(args: argparse.Namespace) -> None:
     sparse_map = measured.sparse_map
     print(f"{out}: {MAP_FILE}, metrics.json, coverage.png, points.png", describe_points(sparse_map), sep="\n")
     if (cameras := measured.result["map"]["cameras"]) > 1:
-        print(f"{cameras} cameras: their intrinsics are taken as given; a lens is only fitted where there is one")
+        print(f"{cameras} cameras: their intrinsics are taken as given; a lens is fitted for a single camera only")
     print(write_coverage(sparse_map, out / "coverage.png"))
     write_points({"map": sparse_map}, measured.test, out / "points.png", sparse_map.scene)
     print(measured.describe())
@@ -64,9 +64,9 @@ def _change(args: argparse.Namespace) -> None:
     path = args.source / MAP_FILE if args.source.is_dir() else args.source
     before = after = SparseMap.load(path)
     if args.width or args.points:
-        raise InputError(f"{path}: is built already. Leave out --{'width' if args.width else 'points'}.")
+        raise InputError(f"{path}: exists already. Leave out --{'width' if args.width else 'points'}.")
     if (args.add or args.remove) and args.out is None:
-        raise InputError(f"{path}: is not overwritten unasked. Give --out FOLDER, which may be {path.parent}.")
+        raise InputError(f"{path}: would be overwritten. Give --out FOLDER, which may be {path.parent}.")
     out = args.out or path.parent
     recipe = recipe_of(args.test) if args.test else None
     test = read_frames(recipe, "test") if recipe else None
@@ -105,24 +105,29 @@ def _parser() -> OptionParser:
     parser.add_argument(
         "--frames",
         type=whole_number(LEAST["key_frames"]),
-        help="key frames, of the training frames or of those added; 160",
+        help="number of key frames among the training or added frames (default: 160)",
     )
     parser.add_argument(
         "--width",
         type=whole_number(LEAST["width"]),
-        help="of the images in which keypoints are searched, in pixels; narrower ones are searched as they are",
+        help="width in pixels at which keypoints are searched; narrower images keep their size",
     )
-    parser.add_argument("--points", choices=POINTS, help="our own unless given, or those of an imported COLMAP model")
-    parser.add_argument("--out", type=Path, help="folder to write to; a new map's is runs/NAME unless given")
+    parser.add_argument(
+        "--points", choices=POINTS, help="triangulated: MambaLoc's own (default); colmap: of an imported COLMAP model"
+    )
+    parser.add_argument("--out", type=Path, help="folder to write to (default for a new map: runs/NAME)")
     change = parser.add_mutually_exclusive_group()
     change.add_argument(
         "--add", type=Path, metavar="FRAMES", help="a scene or recipe with poses, a folder of images, or a video"
     )
-    change.add_argument("--remove", metavar="NAME", help="what was added under this name")
-    parser.add_argument("--name", help="of what is added, by which it may be removed; that of FRAMES unless given")
+    change.add_argument("--remove", metavar="NAME", help="remove what was added under this name")
+    parser.add_argument("--name", help="name of the added frames, for --remove (default: that of FRAMES)")
     cameras = parser.add_mutually_exclusive_group()
     cameras.add_argument(
-        "--intrinsics", type=pinhole_matrix, metavar="FX,FY,CX,CY", help="of images to add; the map's unless given"
+        "--intrinsics",
+        type=pinhole_matrix,
+        metavar="FX,FY,CX,CY",
+        help="intrinsics of the images to add (default: the map's)",
     )
     cameras.add_argument(
         "--distorted",

@@ -12,7 +12,7 @@ def main() -> None:
     quieten()
     parser = OptionParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("--tag", required=True, help="of its name, ARCH.TAG")
+    parser.add_argument("--tag", required=True, help="TAG of the released name ARCH.TAG")
     parser.add_argument("--zoo", type=Path, default=Path("zoo"), help="folder of released models")
     args = parser.parse_args()
     folder = publish(args.checkpoint, args.tag, args.zoo)

@@ -18,23 +18,23 @@ def main() -> None:
     """Read the command line and render."""
     parser = OptionParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path, metavar="OUT", help="folder in which the scene's folder is made")
-    parser.add_argument("--poses", type=Path, help="CSV scene,split,image,x,y,z,qw,qx,qy,qz; else the embedded room")
+    parser.add_argument(
+        "--poses", type=Path, help="CSV with columns scene,split,image,x,y,z,qw,qx,qy,qz (default: the embedded room)"
+    )
     parser.add_argument("--scene", help="which scene of the CSV")
-    parser.add_argument("--layout", choices=["7scenes", "cambridge"], help="7scenes unless given")
-    parser.add_argument("--size", help="WIDTHxHEIGHT of the images; 320x240 unless given")
+    parser.add_argument("--layout", choices=["7scenes", "cambridge"], help="layout of the files (default: 7scenes)")
+    parser.add_argument("--size", help="WIDTHxHEIGHT of the images (default: 320x240)")
     parser.add_argument("--limit", type=whole_number(1), help="at most so many frames of each split, evenly spaced")
-    parser.add_argument("--seed", type=whole_number(0), help="another seed is another room")
+    parser.add_argument("--seed", type=whole_number(0), help="seed of the room")
     args = parser.parse_args()
     if args.poses is None:
         given = [name for name in ("scene", "layout", "size", "limit", "seed") if getattr(args, name) is not None]
         if given:
-            raise InputError(
-                f"--{given[0]}: is of a room along --poses; the embedded room is always the same. Give both."
-            )
+            raise InputError(f"--{given[0]}: needs --poses, since the embedded room is always the same. Give both.")
         print(rendering.ensure_embedded_scene(args.out))
         return
     if args.scene is None:
-        raise InputError("--poses: holds several scenes; choose one with --scene")
+        raise InputError("--poses: has several scenes; choose one with --scene")
     layout: Literal["7scenes", "cambridge"] = args.layout or "7scenes"
     size = rendering.parse_size(args.size or "320x240")
     shots = rendering.read_pose_table(args.poses, args.scene, layout)

@@ -11,18 +11,20 @@ from mambaloc.errors import InputError
 def main() -> None:
     """Serve bundles until Ctrl-C."""
     parser = OptionParser(description=__doc__)
-    parser.add_argument("bundles", nargs="*", type=Path, metavar="BUNDLE", help="the embedded room's unless given")
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen at; any but this machine's needs a token"
+        "bundles", nargs="*", type=Path, metavar="BUNDLE", help="bundles to serve (default: the embedded room's)"
     )
-    parser.add_argument("--port", type=whole_number(0, 65535), default=8000, help="0 takes a free one")
-    parser.add_argument("--workers", type=whole_number(1, 256), default=os.cpu_count(), help="processes that localize")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on; any but localhost needs a token")
+    parser.add_argument("--port", type=whole_number(0, 65535), default=8000, help="0 chooses a free port")
+    parser.add_argument(
+        "--workers", type=whole_number(1, 256), default=os.cpu_count(), help="number of worker processes"
+    )
     parser.add_argument("--token-file", type=Path, help="file of the token that requests must carry")
     parser.add_argument("--megabytes", type=whole_number(1, 1024), default=32, help="largest body of a request")
     parser.add_argument(
         "--distorted",
         action="store_true",
-        help="images are as the training camera stores them, unless a request says distorted=false",
+        help="images are distorted, as the training camera stores them, unless a request has distorted=false",
     )
     args = parser.parse_args()
     try:
@@ -41,7 +43,7 @@ def _by_name(paths: list[Path]) -> dict[str, Path]:
         whole = path.resolve()
         name = whole.parent.name if whole.name == "bundle" else whole.name
         if name in named:
-            raise InputError(f"{path}: is called {name}, as {named[name]} is. Rename one of the folders.")
+            raise InputError(f"{path}: has the same name, {name}, as {named[name]}. Rename one of the folders.")
         named[name] = path
     return named
 

@@ -13,7 +13,7 @@ def main() -> None:
     """Print each model's deviation; exit with code 2 where one is larger than the bundle allows."""
     parser = OptionParser(description=__doc__)
     parser.add_argument("bundle", type=Path)
-    parser.add_argument("--threads", type=thread_count, help="that one image may use")
+    parser.add_argument("--threads", type=thread_count, help="threads for an image")
     args = parser.parse_args()
     deviations = verify_bundle(args.bundle, args.threads)
     print_deviations(deviations)

@@ -16,10 +16,10 @@ def main(argv: list[str] | None = None) -> None:
     """Draw trained systems on the test frames of their recipes, changed where an option says so."""
     quieten()
     parser = OneLineErrorParser(description=__doc__)
-    parser.add_argument("kind", choices=list(FIGURES), help="trajectory: a figure a system; others: all in one")
+    parser.add_argument("kind", choices=list(FIGURES), help="trajectory: a figure per system; others: one figure")
     parser.add_argument("checkpoints", type=Path, nargs="+", metavar="CHECKPOINT")
-    parser.add_argument("--out", type=Path, help="folder of the figures; RUN/figures/EPOCH of the first unless given")
-    parser.add_argument("--frames", type=int, default=3, help="how many test frames are shown, evenly spaced")
+    parser.add_argument("--out", type=Path, help="folder for the figures (default: RUN/figures/EPOCH of the first)")
+    parser.add_argument("--frames", type=int, default=3, help="number of test frames to show, evenly spaced")
     parser.add_function_arguments(build_data, "data")
     args = parser.parse_args(argv, defaults=False)
     trained = [_trained(parser, argv, path) for path in args.checkpoints]
@@ -35,5 +35,5 @@ def _trained(parser: OneLineErrorParser, argv: list[str] | None, path: Path) -> 
     parser.set_defaults({f"data.{name}": value for name, value in checkpoint.data().hparams.items()})
     data = build_data(**parser.parse_args(argv).data)
     if isinstance(data, MultiSceneDataModule):
-        raise InputError(f"{path}: knows several scenes, which have no figure in common. mambaloc evaluate draws each.")
+        raise InputError(f"{path}: has several scenes. Use mambaloc evaluate, which draws a figure for each.")
     return load_trained(checkpoint, data)

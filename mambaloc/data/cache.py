@@ -88,7 +88,7 @@ def cached_frames(
     for row, rule in meta["bad"]:
         bad.reject(paths[row], rule)
     if not meta["rows"]:
-        raise InputError(f"{paths[0].parent}: none of {len(paths)} images can be used")
+        raise InputError(f"{paths[0].parent}: none of {len(paths)} images can be decoded")
     rows = np.array(meta["rows"], dtype=np.int64)
     images = np.load(folder / "images.npy", mmap_mode="r")[: len(rows)]
     return FrameCache(images, rows, folder.name, np.array(meta["sizes"], dtype=np.int64))

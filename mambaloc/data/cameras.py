@@ -63,7 +63,7 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
     if colmap:
         return _of_model(_of_colmap(colmap, size), colmap, folder, size, frames)
     raise UnknownCameraError(
-        f"{folder}: does not give its cameras: there is neither {NVM_FILE} nor a COLMAP model in "
+        f"{folder}: has no cameras: neither {NVM_FILE} nor a COLMAP model in "
         f"{' or '.join(COLMAP_FOLDERS)}. Add such a file, or import the scene with mambaloc import."
     )
 
@@ -182,7 +182,7 @@ def _captured(path: Path, told: Any, name: str) -> tuple[Floats, Size]:
     camera = told.get(name) if isinstance(told, dict) else None
     if camera is None or (isinstance(camera, dict) and not {"focal_px", "centre_px"} <= set(camera)):
         raise UnknownCameraError(
-            f"{path}: does not say focal length and centre of camera {name!r}. Import the scene with its intrinsics, "
+            f"{path}: has no focal length and centre of camera {name!r}. Import the scene with its intrinsics, "
             "or add 'width', 'height', 'focal_px': [x, y] and 'centre_px': [x, y] under 'cameras' there, and the "
             f"camera's name to {FRAMES_FILE}."
         )

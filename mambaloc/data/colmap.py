@@ -66,7 +66,7 @@ def load_colmap(path: Path) -> Any:
     pycolmap = import_pycolmap(path)
     for name in ("cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"):  # all before COLMAP reads any
         if (path / name).is_file() and not _is_whole(name, (path / name).read_bytes()):
-            raise InputError(f"{path / name}: is cut off or counts more than it holds; export the model again")
+            raise InputError(f"{path / name}: is truncated; export the model again")
     with readable(path) as (folder, names):
         try:
             model = pycolmap.Reconstruction(folder)
@@ -90,9 +90,7 @@ def import_pycolmap(needed_by: Path) -> Any:
     try:
         import pycolmap
     except ImportError:
-        raise InputError(
-            f"{needed_by}: is read by pycolmap, which is missing; pip install 'mambaloc[colmap]'"
-        ) from None
+        raise InputError(f"{needed_by}: needs pycolmap. Run pip install 'mambaloc[colmap]'.") from None
     return pycolmap
 
 

@@ -37,7 +37,7 @@ def readable(path: Path) -> Iterator[tuple[Path, dict[int, str]]]:
     is_binary = (path / "images.bin").is_file()
     cameras, points = (path / f"{name}{'.bin' if is_binary else '.txt'}" for name in ("cameras", "points3D"))
     if not cameras.is_file():
-        raise InputError(f"{cameras}: is missing beside {'images.bin' if is_binary else 'images.txt'}; export it, too")
+        raise InputError(f"{cameras}: is missing next to {'images.bin' if is_binary else 'images.txt'}; export it, too")
     if is_binary and points.is_file():
         yield path, {}
         return
@@ -73,7 +73,7 @@ def _numbered(source: Path, target: Path) -> dict[int, str]:
         for number, words, points in _images(source):
             image = int(words[0])
             if image in names:
-                raise InputError(f"{source}, line {number}: gives the number {image} to a second image; change one")
+                raise InputError(f"{source}, line {number}: image number {image} is used twice; change one")
             names[image] = words[_BEFORE_NAME]
             file.write(f"{' '.join(words[:_BEFORE_NAME])} {image}\n{points}\n")
     return names

@@ -90,8 +90,8 @@ class Scene:
             raise InputError(f"data.points_per_frame {self.points_per_frame}: must be 0 or more; 0 reads none")
         if self.views and self.clip_length > 1:
             raise InputError(
-                f"data.clip_length {self.clip_length}: data.views are single images, of no sequence. Set one of the "
-                "two off."
+                f"data.clip_length {self.clip_length}: clips need sequences, but data.views are single images. "
+                "Turn off one of the two."
             )
 
     @property

@@ -28,7 +28,7 @@ def lan_address() -> str:
             probe.connect(("192.0.2.1", 9))  # an address of no machine; nothing is sent
             return str(probe.getsockname()[0])
         except OSError:
-            raise InputError("--lan: this machine is on no network; join one, or leave --lan out") from None
+            raise InputError("--lan: this machine has no network. Join one, or leave --lan out.") from None
 
 
 def self_signed(address: str) -> ssl.SSLContext:
@@ -86,4 +86,4 @@ def _need(package: str) -> None:
     try:
         import_module(package)
     except ImportError:
-        raise InputError(f"--lan: needs the package {package}; pip install 'mambaloc[lan]'") from None
+        raise InputError(f"--lan: needs the package {package}. Run pip install 'mambaloc[lan]'.") from None

@@ -77,7 +77,7 @@ def serve(site: Path, port: int, host: str = LOOPBACK, tls: ssl.SSLContext | Non
     except OverflowError:
         raise InputError(f"--port {port}: ports go from 0 to 65535") from None
     except OSError as error:
-        raise InputError(f"--port {port}: cannot be listened at ({error.strerror}); choose another") from None
+        raise InputError(f"--port {port}: cannot be opened ({error.strerror}); choose another") from None
     if tls is not None:
         server.socket = tls.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
     return server

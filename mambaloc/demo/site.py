@@ -37,7 +37,7 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
     """
     verify_bundle(bundle)
     if out.exists():
-        raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
+        raise InputError(f"{out}: already exists; choose another folder with --out, or remove it")
     modules = node_modules()
     with whole_folder(out, "choose another folder with --out") as site:
         with as_file(_WEB) as web:
@@ -77,7 +77,7 @@ def _install(folder: Path, dev: bool) -> None:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode:
         reason = next((line for line in done.stderr.splitlines() if line.strip()), "no reason given")
-        raise InputError(f"npm ci: failed ({reason.strip()}); is there a network?")
+        raise InputError(f"npm ci: failed ({reason.strip()}). Check the network.")
 
 
 def _listed(bundle: Path) -> list[str]:
@@ -96,4 +96,4 @@ def _add_video(site: Path, film: Path | None) -> None:
         shutil.copyfile(film, site / file)
         (site / POSES_FILE).write_text(json.dumps({"file": file}) + "\n", encoding="utf-8")
     else:
-        raise InputError(f"{film}: no video; give a video that browsers play, as MP4 or WebM")
+        raise InputError(f"{film}: no video that browsers play; give an MP4 or WebM")

@@ -93,7 +93,7 @@ def _history(trained: Trained) -> list[dict[str, float]]:
 def _training_frames(trained: Trained) -> int:
     data = trained.checkpoint.provenance.get("data")
     if data is None:
-        raise InputError(f"{trained.checkpoint.path}: does not say how many frames it was trained on; train it again")
+        raise InputError(f"{trained.checkpoint.path}: has no number of training frames; train it again")
     return data["train_frames"]
 
 

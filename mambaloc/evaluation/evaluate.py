@@ -111,7 +111,7 @@ def _first_backbone(checkpoint: Checkpoint) -> PooledBackbone:
     """The backbone as the training started from it."""
     arguments = checkpoint.backbone_arguments
     if not arguments["weights"]:
-        raise InputError("--retrieval: this backbone started from scratch; such features find nothing, leave it out")
+        raise InputError("--retrieval: needs a backbone that started from pretrained weights. Leave it out.")
     return PooledBackbone(**arguments)
 
 

@@ -45,7 +45,7 @@ def draw_figures(kind: str, trained: Sequence[Trained], out: Path, frames: int =
             written.
     """
     if not 1 <= frames <= MOST_FRAMES:
-        raise InputError(f"--frames {frames}: give 1 to {MOST_FRAMES}")
+        raise InputError(f"--frames {frames}: must be 1 to {MOST_FRAMES}")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)  # told now rather than once all is computed
     return FIGURES[kind](trained, out, frames)
@@ -130,7 +130,9 @@ def _same_frames(trained: Sequence[Trained], count: int) -> PoseBatch:
         each.data.setup("test")
         if each.data.crop != first.data.crop:
             sizes = f"{each.data.crop}, but {first.checkpoint.path} {first.data.crop}"
-            raise InputError(f"{each.checkpoint.path}: sees images of {sizes}; draw systems of one image size together")
+            raise InputError(
+                f"{each.checkpoint.path}: takes images of {sizes}; draw systems of one image size together"
+            )
         _check_same_frames(each, first)
     total = len(first.data.frames("test"))
     if count > total:
@@ -142,8 +144,8 @@ def _same_frames(trained: Sequence[Trained], count: int) -> PoseBatch:
 def _check_same_frames(trained: Trained, first: Trained) -> None:
     if _test_fingerprint(trained) != _test_fingerprint(first):
         raise InputError(
-            f"{trained.checkpoint.path}: sees other test frames than {first.checkpoint.path}; draw systems of one "
-            "scene together, or give them one with --data.scene"
+            f"{trained.checkpoint.path}: has other test frames than {first.checkpoint.path}; draw systems of one "
+            "scene together, or set one with --data.scene"
         )
 
 

@@ -84,7 +84,7 @@ def write_bundle(
             map is damaged or of another scene, or nothing is left to write.
     """
     if out.exists():
-        raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
+        raise InputError(f"{out}: already exists; choose another folder with --out, or remove it")
     scenes = data.each_scene()
     if isinstance(data, MultiSceneDataModule) and (sparse_map or "int8" in formats):
         what = f"{sparse_map}: a map is of one scene" if sparse_map else "--to int8: is decided on one scene's frames"

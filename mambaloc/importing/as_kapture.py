@@ -49,12 +49,12 @@ def write_kapture(scene: Path, out: Path) -> tuple[dict[str, int], int]:
             that is there or cannot be written.
     """
     if out.exists():
-        raise InputError(f"{out}: is there already, and nothing is overwritten; remove it, or choose another --out")
+        raise InputError(f"{out}: already exists; remove it, or choose another --out")
     read_scene(scene)
     rows = read_rows(scene)
     used = {name: split for name, split in SPLITS.items() if any(row.split == split for row in rows)}
     if not used:
-        raise InputError(f"{scene}: marks no frame for training, validation or testing; mark some in frames.csv")
+        raise InputError(f"{scene}: has no frame for training, validation or testing; mark some in frames.csv")
     bad = next((row.image for row in rows if "," in row.image.relative_to(scene).as_posix()), None)
     if bad is not None:
         raise InputError(f"{bad}: has a comma in its path, which kapture reads as the end of a value. Rename it.")

@@ -56,7 +56,7 @@ def import_scene(
             made.
     """
     if out.exists():
-        raise InputError(f"{out}: is there already, and no scene is overwritten; remove it, or choose another --out")
+        raise InputError(f"{out}: already exists; remove it, or choose another --out")
     if split not in ASKED:
         raise InputError(f"--split {split}: choose one of {', '.join(ASKED)}")
     if metres_per_unit is not None and not 1 / _MOST_SCALE <= metres_per_unit <= _MOST_SCALE:

@@ -146,13 +146,13 @@ def read_capture(
         InputError: where there is no such source or format, or it cannot be read.
     """
     if not source.exists():
-        raise InputError(f"{source}: there is no such file or folder; give a capture's")
+        raise InputError(f"{source}: no such file or folder; give a capture")
     if kind is not None and kind not in FORMATS:
         raise InputError(f"unknown --format {kind}; choose one of {', '.join(FORMATS)}")
     kind = kind or next((name for name, known in FORMATS.items() if known.matches(source)), None)
     if kind is None:
         known = "; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
-        raise InputError(f"{source}: looks like no format that is known ({known}); name it with --format")
+        raise InputError(f"{source}: the format is not recognized ({known}). Give --format.")
     if topics is not None:
         if kind != "ros_bag":
             raise InputError(f"{source}: is not a ROS bag but {kind}, which has no topics. Omit --topic and --pose-*.")
@@ -162,9 +162,9 @@ def read_capture(
     if not FORMATS[kind].names_images:
         able = ", ".join(name for name, each in FORMATS.items() if each.names_images)
         raise InputError(
-            f"--images {images}: {kind} has its images in the capture. Leave it out; it is for formats that name their "
-            f"images by paths ({able})."
+            f"--images {images}: {kind} has its images in the capture. Leave it out. It is for formats that give "
+            f"paths of images ({able})."
         )
     if not images.is_dir():
-        raise InputError(f"--images {images}: there is no such folder. Give that of the capture's images.")
+        raise InputError(f"--images {images}: no such folder. Give the folder of the capture's images.")
     return FORMATS[kind].read(source, images=images)

@@ -74,7 +74,7 @@ class RelativeLogQuaternionWeights(LogQuaternionWeights):
         if target.clip_length == 1:
             if self.training:
                 raise InputError(
-                    "loss relative_log_quaternion: needs clips of 2 frames or more in the order they were taken, and "
+                    "loss relative_log_quaternion: needs clips of 2 consecutive frames or more, but "
                     "data gives single frames; set data.clip_length (3 in the paper) and data.clip_skip (10)"
                 )
             return absolute

@@ -122,7 +122,7 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
     """
     if len(frames) < 2:
         raise InputError(
-            f"{scene}: triangulation needs two frames or more, and it has {len(frames)}. "
+            f"{scene}: triangulation needs two frames or more, but it has {len(frames)}. "
             "Give more, taken from different places."
         )
     key = frames.select(farthest_first(frames.world_from_cam, settings.key_frames))

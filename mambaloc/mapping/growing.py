@@ -95,7 +95,7 @@ def add_frames(
     if session in sparse_map.sessions:
         raise InputError(f"{session}: is in the map already. Remove it first, or choose another --name.")
     if session in sparse_map.digests:
-        raise InputError(f"{session}: is a name that the map itself uses. Choose another --name.")
+        raise InputError(f"{session}: is the name of the map's own frames. Choose another --name.")
     matched = functools.cache(lambda first, second: match(frames[first].features, frames[second].features))
     poses: dict[int, CameraPose] = {}
     grown, rounds, contradict = sparse_map, 0, 0

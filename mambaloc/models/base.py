@@ -143,7 +143,7 @@ class LitPoseRegressor(L.LightningModule):
         if self.scene_count > 1 and not self.takes_scenes:
             name = getattr(self, "registry_name", type(self).__name__)
             raise InputError(
-                f"model: {name} knows one scene. For data.scenes choose denseloc or multi_scene_transposenet."
+                f"model: {name} learns one scene. For data.scenes choose denseloc or multi_scene_transposenet."
             )
         self.schedule, self.normalise_position, self.compile_mode = schedule, normalise_position, compile_mode
         self._compiled: Callable[..., PosePrediction] | None = None

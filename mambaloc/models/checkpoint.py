@@ -81,7 +81,7 @@ class Checkpoint:
         """
         data = self.data(**changed)
         if (count := len(data.each_scene())) > 1:
-            raise InputError(f"{self.path}: knows {count} scenes, and this is for one. Give a checkpoint of one scene.")
+            raise InputError(f"{self.path}: has {count} scenes, but one is expected. Give a checkpoint of one scene.")
         return data.each_scene()[0]
 
     @property

@@ -33,7 +33,7 @@ def compile_forward(network: nn.Module, mode: CompileMode, accumulated_batches: 
         raise InputError("model.compile_mode: needs a C++ compiler; install g++, or set it to null")
     if accumulated_batches > 1 and mode == "reduce-overhead":
         raise InputError(
-            "model.compile_mode reduce-overhead: a replayed graph overwrites gradients that are to be summed; "
+            "model.compile_mode reduce-overhead: a replayed graph overwrites accumulated gradients; "
             "set it to default, or trainer.accumulate_grad_batches to 1"
         )
     return torch.compile(network.forward, mode=mode)

@@ -160,7 +160,7 @@ class LitDenseLoc(LitPoseRegressor):
         if head == "token" and loss == "cells":
             loss = "learned_weights"
         if head == "token" and len(shared.get("scenes") or ()) > 1:
-            raise InputError("model.head 'token': knows one scene. For data.scenes choose dense.")
+            raise InputError("model.head 'token': learns one scene. For data.scenes choose dense.")
         super().__init__(backbone=backbone, loss=loss, **shared)
 
     def configure_network(self) -> DenseLoc:

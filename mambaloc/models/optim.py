@@ -87,6 +87,6 @@ def check_span(states: Sequence[dict[str, Any]], steps: int) -> None:
     for state in states:
         if (span := state.get("total_steps", state.get("T_max"))) != steps:
             raise InputError(
-                f"--ckpt_path: its schedule spans {span} steps, this training {steps}; keep its length, or "
+                f"--ckpt_path: its schedule has {span} steps, but this training has {steps}; keep its length, or "
                 "start from its weights with model.warm_start"
             )

@@ -33,7 +33,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         reason = next((line for line in str(error).splitlines() if "GLOBAL" in line), "not plain tensors").strip()
         raise InputError(f"{path}: refused, since loading it could run code ({reason}); use a trusted export") from None
     except Exception as error:  # torch's unpickler fails on broken files with KeyError, IndexError, struct.error, ...
-        raise InputError(f"{path}: not a readable checkpoint ({type(error).__name__}); is it complete?") from None
+        raise InputError(
+            f"{path}: cannot be read as a checkpoint ({type(error).__name__}). Check that it is complete."
+        ) from None
     ours = checkpoint.get("mambaloc") if isinstance(checkpoint, dict) else None
     if not isinstance(ours, dict) or "model" not in ours:
         raise InputError(f"{path}: not a MambaLoc checkpoint; give one that a training run wrote")
@@ -69,8 +71,8 @@ def start_from(network: PoseNetwork, path: str | Path, scenes: Sequence[str] = (
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise InputError(
-            f"model.warm_start: {path}: its network is another one ({reason}); "
-            "train that with this recipe's model arguments"
+            f"model.warm_start: {path}: has another network ({reason}); "
+            "train it with this recipe's model arguments"
         ) from None
     return known
 

@@ -131,7 +131,7 @@ class Localizer:
         start = time.perf_counter()
         if is_distorted:
             if intrinsics is not None:
-                raise InputError("intrinsics: of distorted images, the lens says them. Leave out one of the two.")
+                raise InputError("intrinsics: distorted images have those of their lens. Leave out one.")
             rgb, intrinsics = self.undistortion.apply(rgb, str(self._path))
         network = None if self._network is None else self._network.localize(rgb, intrinsics)
         in_map = self._localize_in_map(rgb, intrinsics, network)
@@ -200,7 +200,7 @@ def _warn_of_focal_length(found: MapLocalization) -> None:
         return
     off = f"about {5 * max(1, round(20 * abs(scale - 1)))} % too {'short' if scale > 1 else 'long'}"
     warnings.warn(
-        f"intrinsics: the map's matches say that their focal length is {off}, so its poses are not accepted. "
+        f"intrinsics: the map's matches show that the focal length is {off}, so its poses are not accepted. "
         "Give the intrinsics of these images.",
         InputWarning,
         stacklevel=3,

@@ -42,7 +42,7 @@ class Network:
             raise InputError(f"{self.path}: ONNX Runtime cannot load it ({reason}); export it again") from None
         metadata = self._session.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
-            raise InputError(f"{self.path}: carries no contract of its input; export it with mambaloc export")
+            raise InputError(f"{self.path}: has no contract (metadata of its input). Export it with mambaloc export.")
         self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
         self._check_input()
 
@@ -91,7 +91,7 @@ class Network:
         cameras = [(other.name, other.type, other.shape[-2:]) for other in others]
         if cameras != ([] if self.contract.intrinsics is None else [(INTRINSICS_INPUT, "tensor(float)", [3, 3])]):
             named = [other.name for other in others]
-            raise InputError(f"{self.path}: also takes {named}, as its contract does not say. Export it again.")
+            raise InputError(f"{self.path}: input {named} is not in its contract. Export the model again.")
 
     def _feeds(self, rgb: Image, intrinsics: ArrayLike | None) -> dict[str, NDArray[np.generic]]:
         contract, size = self.contract, rgb.shape[:2]

@@ -93,7 +93,7 @@ def follow(
             ``out`` has no folder.
     """
     if out.is_dir() or not out.absolute().parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder to write that file to; make it, or choose another")
+        raise InputError(f"--out {out}: its folder does not exist; make it, or choose another")
     frames, count = frames_of(source, counts=counts)
     console = Console(stderr=True)
     found: list[tuple[float, Localization]] = []

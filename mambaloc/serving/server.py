@@ -111,7 +111,7 @@ class _Endpoints:
         is_form = request.headers.get("content-type", "").startswith(_MULTIPART)
         pictures = await _within(_BODY_S, self._pictures(request, is_form))
         if self.waiting + len(pictures) > self.limits.waiting:
-            raise HTTPException(503, f"{self.waiting} images wait already. Try again later.", {"Retry-After": "1"})
+            raise HTTPException(503, f"{self.waiting} images are waiting. Try again later.", {"Retry-After": "1"})
         answers = await asyncio.gather(
             *(self._localized(Task(name, each, intrinsics, is_distorted)) for each in pictures)
         )
@@ -128,7 +128,7 @@ class _Endpoints:
         if text not in ("true", "false"):
             raise HTTPException(400, "distorted: give true or false.")
         if text == "true" and intrinsics is not None:
-            raise HTTPException(400, "distorted: the lens says the intrinsics of distorted images. Leave out one.")
+            raise HTTPException(400, "distorted: distorted images have the intrinsics of their lens. Leave out one.")
         return text == "true"
 
     async def _pictures(self, request: Request, is_form: bool) -> list[bytes]:
@@ -246,7 +246,9 @@ def serve_bundles(
     try:
         listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except (OSError, OverflowError) as error:
-        raise InputError(f"--host {host} --port {port}: cannot be listened at ({error}). Choose others.") from None
+        raise InputError(
+            f"--host {host} --port {port}: cannot be opened ({error}). Choose another host or port."
+        ) from None
     # asyncio does so for sockets of its own alone, and answers then wait 40 ms for what they acknowledge.
     listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     app = create_app(workers, limits, token, host)

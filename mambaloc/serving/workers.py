@@ -99,7 +99,7 @@ class Workers:
         except WorkerLostError:
             self.stop()
             raise InputError(
-                "--workers: a worker process does not start. Free some memory, or ask for fewer."
+                "--workers: a worker process did not start. Free some memory, or use fewer workers."
             ) from None
         for worker in self._workers:
             self._idle.put_nowait(worker)

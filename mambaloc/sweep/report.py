@@ -46,7 +46,7 @@ def write_report(
     if not rows:
         raise InputError(f"{store}: contains no result of the {epoch} epoch; run a sweep into it first")
     if out.exists():
-        raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
+        raise InputError(f"{out}: already exists; choose another folder with --out, or remove it")
     sections = [_results(rows), *_with_maps(rows)]
     for number, (axis, before, after) in enumerate(comparisons):
         found = differences(trials, axis, before, after, epoch)

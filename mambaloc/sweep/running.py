@@ -186,7 +186,9 @@ def _alone(out: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        raise InputError(f"{out}: another process runs trials into it; wait for it, or choose another --out") from None
+        raise InputError(
+            f"{out}: another process is writing trials there; wait for it, or choose another --out"
+        ) from None
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
     try:

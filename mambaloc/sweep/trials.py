@@ -84,12 +84,12 @@ def read_sweep(path: Path) -> Sweep:
     """
     told = read_yaml(path, "give a sweep of trainings", "repair it")
     if not isinstance(told, dict) or not isinstance(told.get("axes"), dict) or not told["axes"]:
-        raise InputError(f"{path}: names no axes; a sweep has 'axes', each with labels and their arguments")
+        raise InputError(f"{path}: has no 'axes'. Add axes with labels and their arguments.")
     for old, new in _RENAMED.items():
         if old in told:
             raise InputError(f"{path}: '{old}' is now called '{new}'. Rename the key.")
     if unknown := sorted(set(map(str, told)) - set(_KEYS)):
-        raise InputError(f"{path}: has {', '.join(unknown)}; a sweep has {', '.join(_KEYS)}")
+        raise InputError(f"{path}: unknown key {', '.join(unknown)}; choose among {', '.join(_KEYS)}")
     axes = {str(axis): _labels(path, str(axis), labels) for axis, labels in told["axes"].items()}
     numbers = {name: _number(path, name, told.get(name, default)) for name, default in _NUMBERS.items()}
     excluded = [_combination(path, axes, entry) for entry in told.get("exclude") or []]
@@ -123,7 +123,10 @@ def _trials(
             place = dict(zip(axes, labels, strict=True))
             needs = [_place_of(path, place, match) for arg in args for match in _OTHER_RUN.finditer(arg)]
             if lacking := next((need for need in needs if need not in made and need not in waiting), None):
-                raise InputError(f"{path}: {' '.join(labels)} needs the run of {' '.join(lacking)}, which is excluded")
+                raise InputError(
+                    f"{path}: {' '.join(labels)} needs the run of {' '.join(lacking)}, which is excluded; do "
+                    "not exclude it"
+                )
             if all(need in made for need in needs):
                 after = tuple(made[need].key for need in needs)
                 made[labels] = Trial(place, args, _digest(path, args, after), after)

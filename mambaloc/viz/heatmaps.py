@@ -171,7 +171,8 @@ def _pooling(backbone: nn.Module) -> nn.Module:
     pools = [m for m in backbone.modules() if isinstance(m, SelectAdaptivePool2d | nn.AdaptiveAvgPool2d)]
     if not pools:
         raise InputError(
-            f"backbone {getattr(backbone, 'name', backbone)!r}: pools no map of features; draw systems of convolutions"
+            f"backbone {getattr(backbone, 'name', backbone)!r}: has no spatial feature map, which Grad-CAM needs; "
+            "choose a convolutional backbone"
         )
     return pools[-1]
 

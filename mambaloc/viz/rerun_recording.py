@@ -171,9 +171,9 @@ def check_recording(path: Path) -> None:
         InputError: without Rerun, for a name that does not end in ``.rrd``, or where there is no folder for it.
     """
     if path.suffix != ".rrd":
-        raise InputError(f"--rerun {path}: is not a recording's name. Give one that ends in .rrd.")
+        raise InputError(f"--rerun {path}: is not the name of a recording. Give a file that ends in .rrd.")
     if path.is_dir() or not path.absolute().parent.is_dir():
-        raise InputError(f"--rerun {path}: there is no folder to write that file to. Make it, or choose another.")
+        raise InputError(f"--rerun {path}: its folder does not exist. Make it, or choose another.")
     try:
         import rerun  # only here: an extra  # noqa: F401
     except ImportError:

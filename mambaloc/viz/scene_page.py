@@ -46,7 +46,7 @@ def write_scene_page(
     try:
         from plotly.graph_objects import Figure
     except ImportError:
-        raise InputError(f"{path.name}: is drawn by plotly, which is missing; pip install 'mambaloc[viz]'") from None
+        raise InputError(f"{path.name}: needs plotly. Run pip install 'mambaloc[viz]'.") from None
     index = table.index.tolist()
     ours, theirs = [names[i] for i in index], [sequences[i] for i in index]
     told = _told(ours, table.position_error_m.tolist(), table.rotation_error_deg.tolist())

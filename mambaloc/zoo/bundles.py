@@ -58,9 +58,7 @@ def load_with_scene(source: str) -> tuple[LitPoseRegressor, PoseDataModule]:
     """
     system, data = load_with_data(source)
     if isinstance(data, MultiSceneDataModule):
-        raise InputError(
-            f"{source}: knows {system.scene_count} scenes, and this is for one. Give a model of one scene."
-        )
+        raise InputError(f"{source}: has {system.scene_count} scenes, but one is expected. Give a model of one scene.")
     return system, data
 
 

@@ -53,9 +53,9 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
     checkpoint = Checkpoint.read(path)
     folder = zoo / f"{checkpoint.provenance['model']}.{tag}"
     if not re.fullmatch(r"[a-z0-9_]+", tag):
-        raise InputError(f"--tag {tag}: lower-case letters, digits and underscores make a tag; choose another")
+        raise InputError(f"--tag {tag}: may have lower-case letters, digits and underscores only; choose another")
     if folder.exists():
-        raise InputError(f"{folder}: is released already; choose another tag")
+        raise InputError(f"{folder}: already exists; choose another tag")
     system, data, sparse_map = checkpoint.system(), checkpoint.scene_data(), map_of(str(path))
     if sparse_map is not None:
         check_scene(sparse_map, SparseMap.load(sparse_map), data)
@@ -136,7 +136,7 @@ def _result(measured: dict[str, Any]) -> Result:
     data, metrics, training = measured["data"], measured["metrics"], measured["training"]
     evaluation, clock = measured["evaluation"], training["wall_clock"]
     if clock is None:
-        raise InputError("the checkpoint has no training time. Publish a checkpoint of mambaloc train.")
+        raise InputError("has no training time. Publish a checkpoint of mambaloc train.")
     return Result(
         data=f"{data['dataset']}/{data['scene']}",
         official_split=bool(data["official_split"]),

@@ -56,5 +56,5 @@ def create_transform(system: LitPoseRegressor) -> Transform:
     """
     short_side = system.provenance.get("data", {}).get("short_side")
     if short_side is None:
-        raise InputError(f"{system.registry_name}: does not say what images it was trained on. Load a trained one.")
+        raise InputError(f"{system.registry_name}: has no record of its training images. Load a trained system.")
     return Transform(Preprocessing(short_side, system.image_size))

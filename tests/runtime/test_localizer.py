@@ -176,7 +176,7 @@ def test_what_is_no_model(model, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"contract": 2}, "version 2, this reads 1"),
+        ({"contract": 2}, "version 2, but version 1 is expected"),
         ({"preprocessing": {"short_side": 48}}, "cannot be read"),
         ({"preprocessing": {"short_side": 48, "crop": [1, 2, 3], "in_model": False}}, "cannot be read"),
         ({"trained": 3}, "cannot be read"),

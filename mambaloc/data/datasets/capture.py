@@ -99,7 +99,7 @@ def read_scene(folder: Path) -> dict[str, Any]:
     if not isinstance(told, dict) or VERSION_KEY not in told:
         raise InputError(f"{path}: is not of an imported scene; make one with mambaloc import")
     if told[VERSION_KEY] != VERSION:
-        raise InputError(f"{path}: is of version {str(told[VERSION_KEY])[:20]}, this reads {VERSION}; {_MEND}")
+        raise InputError(f"{path}: has version {str(told[VERSION_KEY])[:20]}, but {VERSION} is expected; {_MEND}")
     return told
 
 

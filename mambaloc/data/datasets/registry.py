@@ -126,7 +126,7 @@ def _add_from_packages(name: str) -> None:
     found = load_plugin(plugins.DATASETS, name)
     if found is None:
         known = {*DATASETS, *plugin_names(plugins.DATASETS)}
-        raise InputError(f"data.dataset {name!r}: there is no such dataset. {suggestion(name, sorted(known))}")
+        raise InputError(f"data.dataset {name!r}: no such dataset. {suggestion(name, sorted(known))}")
     if not isinstance(found, Dataset) or found.name != name:
         raise InputError(f"data.dataset {name!r}: its package gives no Dataset of that name. Correct its entry point.")
     DATASETS[name] = found

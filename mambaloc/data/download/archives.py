@@ -64,7 +64,7 @@ def _unpack(
                     target.unlink()
             return written
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
-        raise InputError(f"{name}: no zip that can be read ({error}); delete it and download it again") from None
+        raise InputError(f"{name}: cannot be read as a zip ({error}). Delete it and download it again.") from None
 
 
 def _judge(

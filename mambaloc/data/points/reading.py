@@ -48,7 +48,7 @@ def read_points(folder: Path, frames: Frames, cameras: Cameras, count: int, seed
         )
     if not points.per_frame().any():
         raise InputError(
-            f"{folder}: its {points.source} contains no point for any of {len(frames)} frames; "
+            f"{folder}: its {points.source} has no point for any of {len(frames)} frames; "
             "repair it, or choose a model that needs no points"
         )
     return points

@@ -18,7 +18,7 @@ def read_track_points(folder: Path, frames: Frames, count: int, seed: int) -> Sc
     """
     tracks = tracks_of_frames(folder, frames)
     if tracks is None:
-        raise InputError(f"{folder / POINTS_FILE}: there is no such file. Import the scene again.")
+        raise InputError(f"{folder / POINTS_FILE}: no such file. Import the scene again.")
     seen = [tracks.points_m[tracks.point[tracks.frame == row]] for row in range(len(frames))]
     drawn = [
         choose(points_m, count, frame_rng(seed, image))

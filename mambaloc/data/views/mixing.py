@@ -103,7 +103,9 @@ class MixedSampler(DistributedSampler[int]):
     def __init__(self, data: FramesAndViews, batch_size: int, num_replicas: int, rank: int, seed: int) -> None:
         super().__init__(range(len(data.frames)), num_replicas, rank, shuffle=True, seed=seed)  # type: ignore[arg-type]
         if batch_size < 2:
-            raise InputError("data.batch_size 1: has no room for a frame and a view. Enlarge it, or set data.views 0.")
+            raise InputError(
+                "data.batch_size 1: is too small for a frame and a view. Increase it, or set data.views to 0."
+            )
         self.first, self.views, self.batch_size = len(data.frames), len(data.views), batch_size
         self.real_per_batch = batch_size - min(max(round(data.share * batch_size), 1), batch_size - 1)
 

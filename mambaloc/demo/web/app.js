@@ -1,4 +1,4 @@
-/** The page: what is chosen, what runs, what is said. */
+/** The page: what is chosen, what runs, what is shown. */
 
 import { describe } from "./about.js";
 import { Engine } from "./engine.js";

@@ -1,4 +1,4 @@
-/** What lens took an image, if the page is told, and what part of the image the model sees. */
+/** What lens took an image, if it is stated, and what part of the image the model sees. */
 
 import { cameraOfLens, framing } from "./framing.js";
 

@@ -93,7 +93,7 @@ export function checkContract(contract) {
   if (contract?.contract !== CONTRACT_VERSION) {
     const found = JSON.stringify(contract?.contract) ?? "none";
     throw new Error(
-      `The bundle's contract is of version ${found}, this reads ${CONTRACT_VERSION}; export it anew.`,
+      `The bundle's contract has version ${found}, but version ${CONTRACT_VERSION} is expected. Export it again.`,
     );
   }
 }
@@ -101,6 +101,6 @@ export function checkContract(contract) {
 /** The most exact of a bundle's models. */
 export function modelOf(contract) {
   const found = MODELS.find((file) => file in contract.files);
-  if (!found) throw new Error(`The bundle holds none of ${MODELS.join(", ")}; export it anew.`);
+  if (!found) throw new Error(`The bundle contains no ${MODELS.join(" or ")}. Export it again.`);
   return found;
 }

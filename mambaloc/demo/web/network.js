@@ -34,7 +34,7 @@ export class Network {
    * @param {number[][]|null} intrinsics pinhole matrix in its pixels, which a model that takes none leaves unread; the
    *   training camera's unless given.
    * @returns `world_from_cam`: the camera centre in metres, a unit quaternion wxyz, and what it took; where the model
-   *   tells them, the radii that most poses are within, and the unfamiliarity, over 1 for an image of elsewhere; where
+   *   estimates them, the radii that most poses are within, and the unfamiliarity, over 1 for an image of elsewhere; where
    *   it knows several scenes, the likeliest one's name, probability, and offset in its world, in whose frame the pose is.
    */
   async localize(image, intrinsics = null) {

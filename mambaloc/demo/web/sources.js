@@ -8,7 +8,7 @@ export async function decoded(blob, name) {
   try {
     return await createImageBitmap(blob, AS_STORED);
   } catch {
-    throw new Error(`${name} is no image that this browser can read; give a JPEG or PNG.`);
+    throw new Error(`${name} is not an image that this browser can read. Give a JPEG or PNG.`);
   }
 }
 

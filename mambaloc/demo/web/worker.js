@@ -149,7 +149,7 @@ async function fetched(path, name = "") {
   return new Uint8Array(await new Blob(chunks).arrayBuffer());
 }
 
-/** Refuse a model that is not the one that its contract was written with. False: a page without HTTPS cannot tell. */
+/** Refuse a model that is not the one that its contract was written with. False: a page without HTTPS cannot check. */
 async function checkDigest(file, bytes, expected) {
   if (!self.crypto?.subtle) return false;
   const digest = new Uint8Array(await self.crypto.subtle.digest("SHA-256", bytes));
@@ -157,7 +157,7 @@ async function checkDigest(file, bytes, expected) {
   if (found !== expected) {
     throw new Error(
       `${file} is not the file that its contract was written with (sha256 ${found.slice(0, 12)}…, not ` +
-        `${expected.slice(0, 12)}…); get the bundle anew.`,
+        `${expected.slice(0, 12)}…); get the bundle again.`,
     );
   }
   return true;

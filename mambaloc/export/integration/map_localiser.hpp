@@ -471,7 +471,7 @@ class MapLocalizer {
     nugget_ = about["nugget"].empty() ? 1e-3 : double(about["nugget"]);
     const auto array = [&](const char* name, int type, int columns) {
       const cv::FileNode entry = json[name];
-      if (entry.empty()) throw std::runtime_error(std::string("map: lacks ") + name);
+      if (entry.empty()) throw std::runtime_error(std::string("map: missing ") + name);
       const double begin = entry["data_offsets"][0], end = entry["data_offsets"][1];
       const double row = columns * double(CV_ELEM_SIZE(type));
       if (!(0 <= begin && begin <= end && end <= double(bytes.size() - 8 - length)) || std::fmod(end - begin, row) != 0)

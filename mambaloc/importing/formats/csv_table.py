@@ -125,7 +125,7 @@ def _table(source: Path) -> Path:
     tables = sorted(source.glob("*.csv")) or sorted(source.resolve().parent.glob("*.csv"))
     if len(tables) != 1:
         names = ", ".join(table.name for table in tables[:8]) or "none"
-        raise InputError(f"{source}: holds not one CSV file but {names}; give the file itself")
+        raise InputError(f"{source}: has several CSV files: {names}. Give one file.")
     return tables[0]
 
 
@@ -142,7 +142,7 @@ def _rows(path: Path) -> tuple[TableColumns, list[Row]]:
         for values in reader:
             if len(values) != len(names) and values:
                 raise InputError(
-                    f"{path}, line {reader.line_num}: has {len(values)} fields where the first line names "
+                    f"{path}, line {reader.line_num}: has {len(values)} fields, but the first line names "
                     f"{len(names)}; correct or remove it"
                 )
             if values:

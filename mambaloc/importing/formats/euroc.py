@@ -84,7 +84,7 @@ def read_euroc(source: Path, images: Path | None = None) -> Capture:
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     stamps = stamps_of([listed[row][1][0] for row in there])
     if stamps is None:
-        raise InputError(f"{listing}: has time stamps in no unit that is known; correct them")
+        raise InputError(f"{listing}: has time stamps in an unknown unit; correct them")
     pairs, how = by_time(listing, stamps, table.words, table.path)
     checked = from_quaternions(table.numbers[:, :3], table.numbers[:, 3:], table.where)
     sensor_from_cam = np.linalg.inv(_body_from_sensor(truth / "sensor.yaml")) @ body_from_cam

@@ -72,7 +72,7 @@ def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
-        raise InputError(f"{where}: {key} is {str(value)[:40]!r}, no finite number; correct it")
+        raise InputError(f"{where}: {key} is {str(value)[:40]!r}, not a finite number; correct it")
     return float(value)
 
 
@@ -87,7 +87,7 @@ def _camera(told: Mapping[str, Any], images: Sequence[Path], where: str) -> Came
     if not all(1 <= side <= LARGEST_SIDE_PX for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
         raise InputError(f"{where}: {sides[0]:g}x{sides[1]:g} pixels, focal length {focal_px[0]:g}: correct it")
     if not all(-side < at < 2 * side for at, side in zip(center_px, sides, strict=True)):
-        raise InputError(f"{where}: its centre {center_px} is far outside of the image; correct it")
+        raise InputError(f"{where}: its centre {center_px} is far outside the image; correct it")
     camera = Camera(round(sides[0]), round(sides[1]), focal_px, (center_px[0] - CORNER_PX, center_px[1] - CORNER_PX))
     return _with_lens(camera, told, where)
 
@@ -102,7 +102,7 @@ def _focal(told: Mapping[str, Any], axis: int, side: float, where: str) -> float
     if angle_rad is None:
         return 0.0
     if not 0 < angle_rad < math.pi:
-        raise InputError(f"{where}: camera_angle_{key} is {angle_rad:g}, no angle of view in radians; correct it")
+        raise InputError(f"{where}: camera_angle_{key} is {angle_rad:g}, not an angle of view in radians; correct it")
     return side / 2 / math.tan(angle_rad / 2)
 
 
@@ -122,7 +122,9 @@ def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
             "make pinhole images of it first"
         )
     if k4:
-        raise InputError(f"{where}: k4 is {k4:g}, which OpenCV's lens has not; give camera_model OPENCV_FISHEYE, or 0")
+        raise InputError(
+            f"{where}: k4 is {k4:g}, which OpenCV's lens does not have; give camera_model OPENCV_FISHEYE, or 0"
+        )
     if not any(coefficients):
         return replace(camera, model=model)
     lens = OpenCVModel(camera.focal_px, camera.center_px, (k1, k2, p1, p2, k3))

@@ -191,7 +191,7 @@ def first_with_images(folders: Sequence[Path]) -> Path:
         if has_images(folder):
             return folder
     names = ", ".join(str(folder) for folder in folders)
-    raise InputError(f"{names}: none holds an image ({', '.join(IMAGE_SUFFIXES)}); put the images there")
+    raise InputError(f"{names}: no folder contains an image ({', '.join(IMAGE_SUFFIXES)}). Put the images there.")
 
 
 def only_file(found: Iterable[Path], source: Path) -> Path:

@@ -63,7 +63,7 @@ def read_tum_rgbd(source: Path, images: Path | None = None) -> Capture:
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     stamps = stamps_of([words_of[row] for row in there])
     if stamps is None:
-        raise InputError(f"{listing}: has time stamps in no unit that is known; correct them")
+        raise InputError(f"{listing}: has time stamps in an unknown unit; correct them")
     pairs, how = by_time(listing, stamps, table.words, table.path)
     how = "; ".join(filter(None, (how, found.elsewhere)))
     missing = [name for (name, _), file in zip(named, found.files, strict=True) if file in found.missing]

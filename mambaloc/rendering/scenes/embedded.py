@@ -56,7 +56,7 @@ def ensure_embedded_scene(root: Path) -> Path:
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{root}: cannot be rendered to ({error.strerror}); choose another root") from None
+        raise InputError(f"{root}: cannot be written ({error.strerror}); choose another root") from None
     with FileLock(root / f".{EMBEDDED_SCENE}.lock"):
         if folder := _rendered(root, names, note):  # by whoever held the lock before
             return folder
@@ -66,7 +66,7 @@ def ensure_embedded_scene(root: Path) -> Path:
                 return write_7scenes(
                     root, name, shots, room=room, size=_SIZE, seed=_SEED, depth=True, depth_every=_DEPTH_EVERY
                 )
-    raise InputError(f"{root / names[-1]}: is not what this version renders; remove it, or choose another root")
+    raise InputError(f"{root / names[-1]}: was rendered by another version; remove it, or choose another root")
 
 
 def embedded_shots() -> list[Shot]:

@@ -156,7 +156,7 @@ def _new_folder(root: Path, scene: str) -> Iterator[Path]:
     if scene != Path(scene).name or scene in ("", "..") or scene.startswith("."):
         raise InputError(f"scene {scene!r}: must be the plain name of a folder; give one such as 'room'")
     if (root / scene).exists():
-        raise InputError(f"{root / scene}: a scene is never overwritten; remove it, or choose another name or root")
+        raise InputError(f"{root / scene}: already exists; remove it, or choose another name or root")
     root.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{scene}-", dir=root) as draft:
         folder = Path(draft) / scene
@@ -165,7 +165,7 @@ def _new_folder(root: Path, scene: str) -> Iterator[Path]:
         try:
             folder.replace(root / scene)
         except OSError as error:
-            raise InputError(f"{root / scene}: appeared while it was rendered ({error}); remove it") from None
+            raise InputError(f"{root / scene}: was created by another process ({error}); remove it") from None
 
 
 def _render_all(

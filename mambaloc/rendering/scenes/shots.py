@@ -63,7 +63,7 @@ def read_pose_table(path: Path, scene: str, layout: Layout) -> list[Shot]:
         InputError: for a missing column, a row that is not a pose, or a scene that is not in the table.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file; give a CSV with the columns {','.join(_COLUMNS)}")
+        raise InputError(f"{path}: no such file; give a CSV with the columns {','.join(_COLUMNS)}")
     scenes: set[str] = set()
     shots = []
     with open_text(path, newline="") as file:
@@ -76,7 +76,7 @@ def read_pose_table(path: Path, scene: str, layout: Layout) -> list[Shot]:
                 if row["scene"] == scene:
                     shots.append(_shot(row, layout, f"{path}, line {rows.line_num}"))
         except csv.Error as error:  # a field without end
-            raise InputError(f"{path}, line {rows.line_num}: is not a row of a CSV ({error}); correct it") from None
+            raise InputError(f"{path}, line {rows.line_num}: is not a CSV row ({error}); correct it") from None
     if not shots:
         raise InputError(f"{path}: has no row of scene {scene!r}; choose one of {', '.join(sorted(map(str, scenes)))}")
     return shots
@@ -123,7 +123,7 @@ def _shot(row: Mapping[str, str], layout: Layout, where: str) -> Shot:
         raise InputError(f"{where}: split {row['split']!r} is neither train nor test; correct the row")
     image = (row["image"] or "").removeprefix(f"{row['scene']}/")
     if not image.endswith((".png", ".jpg")) or image.startswith("/") or ".." in Path(image).parts:
-        raise InputError(f"{where}: image {image!r} must be a .png or .jpg inside of the scene; correct the row")
+        raise InputError(f"{where}: image {image!r} must be a .png or .jpg inside the scene; correct the row")
     rotation = matrix_from_quaternion(numbers[3:])
     world_from_cam = np.eye(4)
     world_from_cam[:3, :3] = rotation if layout == "7scenes" else rotation.T

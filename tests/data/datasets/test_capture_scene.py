@@ -144,7 +144,7 @@ def test_a_table_that_is_none(scene, content, message):
     [
         ("{", "scene.json: is not JSON"),
         ("[]", "scene.json: is not of an imported scene"),
-        ('{"mambaloc_scene": 2}', "scene.json: is of version 2, this reads 1"),
+        ('{"mambaloc_scene": 2}', "scene.json: has version 2, but 1 is expected"),
         ('{"mambaloc_scene": 1, "sanity": {"verdict": "not usable: 3 frames"}}', "was found not usable: 3 frames"),
     ],
 )
