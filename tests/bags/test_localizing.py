@@ -172,7 +172,7 @@ def test_poses_of_the_robot_are_written_by_its_transforms(drive, tmp_path):
         (["--out", "found", "--filter", "causal"], "--filter causal: a bag's poses are for a robot's own filter"),
         (["--out", "found", "--topic", "/up"], "--topic /up"),
         (["--out", "found", "--pose-frame", "arm"], "no transform links the frames 'camera_optical' and 'arm'"),
-        (["--out", "."], "is there already"),
+        (["--out", "."], "already exists"),
     ],
 )
 def test_wrong_uses_are_refused_in_a_line(drive, tmp_path, monkeypatch, capsys, options, says):

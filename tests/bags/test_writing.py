@@ -39,7 +39,7 @@ def test_an_error_leaves_nothing_and_nothing_is_overwritten(tmp_path, name):
         write(FIRST_NS, POSITION, WXYZ[:3], np.eye(6))
     assert not list(tmp_path.iterdir())
     (tmp_path / name).touch()
-    with pytest.raises(InputError, match="is there already"), pose_bag(tmp_path / name, "map"):
+    with pytest.raises(InputError, match="already exists"), pose_bag(tmp_path / name, "map"):
         pass
 
 

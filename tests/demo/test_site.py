@@ -63,7 +63,7 @@ def test_what_is_refused(bundle, site, tmp_path):
         assert not list(tmp_path.glob(".*"))
 
     refused("give a bundle's folder", tmp_path / "none", tmp_path / "site")
-    refused("is there already", bundle, site)
+    refused("already exists", bundle, site)
     refused("no video", bundle, tmp_path / "site", tmp_path / "none.mp4")
     refused("no video", bundle, tmp_path / "site", tmp_path)  # a folder is not copied whole
     (tmp_path / "film.md").write_text("words")

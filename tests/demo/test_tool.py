@@ -65,7 +65,7 @@ def test_unless_told_otherwise_it_shows_what_the_package_brings(demo, site, bund
         (["{bundle}", "--film", "none.mp4"], "none.mp4: no video"),
         (["{bundle}", "--film", ""], "no video"),
         (["{bundle}", "--port", "70000"], "from 0 to 65535"),
-        (["{bundle}", "--out", "{bundle}"], "is there already"),
+        (["{bundle}", "--out", "{bundle}"], "already exists"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(demo, site, bundle, words, message, capsys):

@@ -334,5 +334,5 @@ def test_a_model_that_deviates_is_not_shipped(student, data, tmp_path, monkeypat
 
 
 def test_a_bundle_is_never_written_over(student, data, tmp_path):
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         write_bundle(student, data, tmp_path)

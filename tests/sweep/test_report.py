@@ -291,7 +291,7 @@ def test_what_cannot_be_reported(store, tmp_path):
         write_report(tmp_path / "nothing", tmp_path / "report")
     with pytest.raises(InputError, match="contains no result of the best epoch"):
         write_report(folder, tmp_path / "report", epoch="best")
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         write_report(folder, folder)
     assert not (tmp_path / "nothing").exists()
 

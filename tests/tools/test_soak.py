@@ -77,5 +77,5 @@ def test_wrong_uses(tmp_path, tiny_recipe, monkeypatch):
     monkeypatch.setattr(soak, "_TRAIN", "import sys; sys.exit(f'{sys.argv[1]} is wrong')")
     with pytest.raises(InputError, match=r"tiny\.yaml: its training ended with 1 \(.*tiny\.yaml.*\); see .*train\.log"):
         measure_soak([tiny_recipe], 40, tmp_path / "out")
-    with pytest.raises(InputError, match="out: is there already; choose another folder with --out"):
+    with pytest.raises(InputError, match="out: already exists; choose another folder with --out"):
         measure_soak([tiny_recipe], 40, tmp_path / "out")

@@ -96,7 +96,7 @@ def test_a_checkpoint_is_published(trained_student, tmp_path, capsys):
             "'tflite' is not one of onnx, fp16, int8, ort",
         ),
         ("export", ["student.embedded_rom"], "Did you mean student.embedded_room?"),
-        ("export", ["{run}/checkpoints/last.ckpt", "--out", "{run}"], "is there already"),
+        ("export", ["{run}/checkpoints/last.ckpt", "--out", "{run}"], "already exists"),
         ("evaluate", ["{run}/checkpoints/last.ckpt", "--retrieval"], "started from scratch"),
         ("verify_bundle", ["nothing"], "give a bundle's folder"),
         ("verify_bundle", ["{run}"], "give a bundle's folder"),

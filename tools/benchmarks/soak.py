@@ -126,7 +126,7 @@ def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]
     if missing := next((recipe for recipe in recipes if not recipe.is_file()), None):
         raise InputError(f"{missing}: no such recipe; give one of recipes/")
     if out.exists():
-        raise InputError(f"{out}: is there already; choose another folder with --out, or remove it")
+        raise InputError(f"{out}: already exists; choose another folder with --out, or remove it")
     with writing(out):
         out.mkdir(parents=True)
     samples, log = out / "samples.jsonl", out / "train.log"
