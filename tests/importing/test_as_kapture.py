@@ -133,7 +133,7 @@ def test_a_scene_without_cameras_has_uncalibrated_ones(scene, tmp_path):
 def test_wrong_uses_are_named_in_one_line_and_leave_nothing(scene, tmp_path):
     (tmp_path / "there").mkdir()
     for folder, out, says in [
-        (scene, tmp_path / "there", "there: already exists, and nothing is overwritten"),
+        (scene, tmp_path / "there", "there: already exists; remove it"),
         (tmp_path / "there", tmp_path / "out", "scene.json: cannot be read"),
     ]:
         with pytest.raises(InputError, match=says):

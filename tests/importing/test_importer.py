@@ -232,7 +232,7 @@ def test_the_tool_says_what_it_found(rendered_once, tmp_path, capsys):
     ("words", "message"),
     [
         (["{tmp}/nothing", "--out", "{tmp}/a"], "there is no such file or folder"),
-        (["{room}", "--out", "{room}"], "already exists, and no scene is overwritten"),
+        (["{room}", "--out", "{room}"], "already exists; remove it"),
         (["{room}", "--out", "{tmp}/a", "--format", "tango"], "--format tango: there is none; choose one of"),
         (["{room}", "--out", "{tmp}/a", "--metres-per-unit", "0"], "--metres-per-unit 0.0: give a number"),
         (["{room}", "--out", "{tmp}/a", "--metres-per-unit", "nan"], "--metres-per-unit nan: give a number"),
