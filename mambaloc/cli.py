@@ -19,6 +19,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from mambaloc.callbacks import (
+    AtomicCheckpointIO,
     EarlyStopping,
     MapBuild,
     MovedRun,
@@ -28,7 +29,6 @@ from mambaloc.callbacks import (
     TrajectoryPlot,
     ViewSheet,
     WallClock,
-    WholeCheckpoints,
 )
 from mambaloc.console import exits_cleanly, quieten
 from mambaloc.data import MultiSceneDataModule, PoseDataModule, build_data
@@ -149,7 +149,7 @@ class RecipeCLI(LightningCLI):
             kwargs["logger"] = [TensorBoardLogger(run_dir, name="", version=""), CSVLogger(run_dir, name="metrics")]
         trainer = super().instantiate_trainer(**kwargs)
         if not config.trainer.plugins:
-            trainer.strategy.checkpoint_io = WholeCheckpoints()
+            trainer.strategy.checkpoint_io = AtomicCheckpointIO()
         return trainer
 
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[L.Callback]) -> L.Trainer:

@@ -20,7 +20,7 @@ _OWN = ("teacher", "hard_weight", "soft_weight", "feature_weight", "soft", "soft
 _PREFIX = "distillation."
 
 
-class Answers(NamedTuple):
+class TeacherTargets(NamedTuple):
     """What a teacher says of images.
 
     Shape:
@@ -36,9 +36,9 @@ class Answers(NamedTuple):
         """The pose as a prediction."""
         return PosePrediction(self.position_m, self.quaternion)
 
-    def of(self, index: Tensor) -> Answers:
+    def of(self, index: Tensor) -> TeacherTargets:
         """Those of some rows."""
-        return Answers(*(each[index] for each in self))
+        return TeacherTargets(*(each[index] for each in self))
 
 
 class Teacher:
@@ -52,12 +52,12 @@ class Teacher:
         self.system = system.eval().requires_grad_(False)
 
     @torch.no_grad()
-    def __call__(self, image: Tensor) -> Answers:
+    def __call__(self, image: Tensor) -> TeacherTargets:
         """Localize images, (B, 3, H, W) in 0..1."""
         network = self.system.to(image.device).network
         branches = network.forward_features(image)
         prediction = network.forward_head(branches)
-        return Answers(prediction.position_m, prediction.quaternion, torch.cat(branches, dim=-1))
+        return TeacherTargets(prediction.position_m, prediction.quaternion, torch.cat(branches, dim=-1))
 
 
 class DistillationTerms(nn.Module):
@@ -132,7 +132,7 @@ class LitDistillation(LitStudent):
         if student.get("feature_cache_gib"):
             raise InputError("model.feature_cache_gib: the teacher needs the images. Set it to 0.")
         super().__init__(**student)
-        self.answers: Answers | None = None
+        self.answers: TeacherTargets | None = None
 
     def setup(self, stage: str) -> None:
         """Meet the teacher before the first epoch; nothing else needs it.
@@ -172,7 +172,7 @@ class LitDistillation(LitStudent):
             batches = data.batches("train")
             shown = track(batches, "Asking the teacher", transient=True, disable=self.global_rank > 0)
             answers = [self.teacher(batch.image.to(self.device)) for batch in shown]
-            self.answers = Answers(*(torch.cat(each) for each in zip(*answers, strict=True)))
+            self.answers = TeacherTargets(*(torch.cat(each) for each in zip(*answers, strict=True)))
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
         """Return the weighed sum of the terms."""

@@ -55,13 +55,13 @@ def cache_dir(made_once):
 def scenes(made_once):
     """A folder of rendered scenes in the 7-Scenes layout; ``heads`` has 2 x 12 training and 8 test frames."""
     from mambaloc.rendering.scenes.layouts import write_7scenes
-    from mambaloc.rendering.scenes.shots import shots_of_sequences
+    from mambaloc.rendering.scenes.shots import frames_of_sequences
     from mambaloc.rendering.trajectories import smooth_trajectory
 
     def render(root: Path) -> None:
         inside_m = ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))
         sequences = {n: smooth_trajectory(8 if n == 3 else 12, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
-        write_7scenes(root, "heads", shots_of_sequences(sequences, {3}), size=(96, 72), depth=True)
+        write_7scenes(root, "heads", frames_of_sequences(sequences, {3}), size=(96, 72), depth=True)
 
     return made_once("scenes", render)
 
@@ -69,11 +69,11 @@ def scenes(made_once):
 @pytest.fixture(scope="session")
 def den(made_once):
     """A root with one scene, the embedded room in the 7-Scenes layout: 32 training and 6 test frames of 160x120."""
-    from mambaloc.rendering import embedded_room, embedded_walk, shots_of_sequences, write_7scenes
+    from mambaloc.rendering import embedded_room, embedded_walk, frames_of_sequences, write_7scenes
 
     def render(root: Path) -> None:
         walks = {number: embedded_walk(count, number, 0.0, 360 / count) for number, count in ((1, 32), (2, 6))}
-        write_7scenes(root, "den", shots_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
+        write_7scenes(root, "den", frames_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
 
     return made_once("den", render)
 

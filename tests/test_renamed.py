@@ -2,11 +2,13 @@
 
 import importlib
 
+import numpy as np
 import pytest
 import torch
 
+from mambaloc.export import Parity
 from mambaloc.nn import PositionScale
-from mambaloc.runtime import Localizer
+from mambaloc.runtime import Localizer, PoseEstimate
 from mambaloc.runtime.maps import MapLocalizer
 
 RENAMED = [
@@ -16,6 +18,11 @@ RENAMED = [
     ("mambaloc.runtime.localisation", "Localisation", "Localization"),
     ("mambaloc.runtime.maps", "MapLocaliser", "MapLocalizer"),
     ("mambaloc.runtime.maps", "MapLocalisation", "MapLocalization"),
+    ("mambaloc.benchmark", "Setting", "BenchmarkConfig"),
+    ("mambaloc.callbacks", "WholeCheckpoints", "AtomicCheckpointIO"),
+    ("mambaloc.rendering", "Shot", "Frame"),
+    ("mambaloc.rendering", "embedded_shots", "embedded_frames"),
+    ("mambaloc.rendering", "shots_of_sequences", "frames_of_sequences"),
     ("mambaloc.demo", "embedded_film", "embedded_video"),
     ("mambaloc.nn", "Discretisation", "Discretization"),
     ("mambaloc.metrics", "summarise", "summarize"),
@@ -50,6 +57,18 @@ def test_old_methods_call_the_new_ones_and_warn(monkeypatch, kind, old, new, arg
     monkeypatch.setattr(kind, new, lambda self, *given: given)
     with pytest.warns(DeprecationWarning, match=rf"{kind.__name__}\.{old} is now {new}\."):
         assert getattr(kind.__new__(kind), old)(*arguments) == arguments
+
+
+@pytest.mark.parametrize(
+    ("record", "old", "new"),
+    [
+        (PoseEstimate(*np.zeros((5, 3))), "turn_rad_s", "angular_velocity_rad_s"),
+        (Parity(0.1, 0.2, 30.0), "reach_m", "max_norm_m"),
+    ],
+)
+def test_old_fields_are_the_new_ones_and_warn(record, old, new):
+    with pytest.warns(DeprecationWarning, match=rf"{type(record).__name__}\.{old} is now {new}\."):
+        assert getattr(record, old) is getattr(record, new)
 
 
 def test_positions_are_normalized_by_the_old_name():

@@ -68,7 +68,7 @@ def test_the_quantile_is_numpys_of_one_more_value(count, level):
 
 def test_too_few_values_tell_nothing():
     assert conformal_quantile(np.arange(9.0), 0.9) == 8
-    with pytest.raises(ValueError, match="8 values tell no 90% quantile"):
+    with pytest.raises(ValueError, match="8 values are too few for a 90% quantile"):
         conformal_quantile(np.arange(8.0), 0.9)
 
 
@@ -203,9 +203,9 @@ def test_without_held_out_frames_nothing_is_told(scenes, changed, message):
 def test_frames_that_were_trained_on_count_for_nothing(scenes):
     system, data = as_if_trained(student(), scene(scenes))
     fit_uncertainty(system, data)
-    with pytest.raises(InputError, match="heads: the system was trained on other frames"):
+    with pytest.raises(InputError, match="heads: the system was trained on other or unknown frames"):
         fit_uncertainty(system, scene(scenes, validation="block", val_fraction=0.4, val_gap=1))
-    with pytest.raises(InputError, match=r"or does not say on which, .*; give a checkpoint's own"):
+    with pytest.raises(InputError, match=r"on other or unknown frames, .*; give a checkpoint's own"):
         fit_uncertainty(student(), data)
 
 
@@ -278,7 +278,9 @@ def test_a_contract_of_another_model_is_refused(exported, tmp_path):
     for entry in model.metadata_props:
         entry.value = contract_of(system, data.hparams).to_json()
     onnx.save(model, tmp_path / "model.onnx")
-    with pytest.raises(InputError, match=r"says \['position_m', .* as its contract does not; export it again"):
+    with pytest.raises(
+        InputError, match=r"outputs \['position_m', .* do not match its contract\. Export the model again"
+    ):
         Localizer(tmp_path / "model.onnx")
 
 

@@ -4,15 +4,16 @@ from mambaloc.benchmark.deployment import Deployment, measure_deployment
 from mambaloc.benchmark.latency import Latency, forward_flops, measure_latency
 from mambaloc.benchmark.reference import PUBLISHED_DATA
 from mambaloc.benchmark.report import print_deployments, print_latencies, print_sizes
-from mambaloc.benchmark.setting import Setting
+from mambaloc.benchmark.setting import BenchmarkConfig
 from mambaloc.benchmark.sizes import Size, size_of, size_table
 from mambaloc.benchmark.speed_report import SpeedReport, measure_all, print_report, write_report
+from mambaloc.renamed import renamed
 
 __all__ = [
     "PUBLISHED_DATA",
+    "BenchmarkConfig",
     "Deployment",
     "Latency",
-    "Setting",
     "Size",
     "SpeedReport",
     "forward_flops",
@@ -27,3 +28,5 @@ __all__ = [
     "size_table",
     "write_report",
 ]
+
+__getattr__ = renamed(__name__, {"Setting": "BenchmarkConfig"})

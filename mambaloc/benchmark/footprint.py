@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import track
 
 from mambaloc.benchmark.clock import now
-from mambaloc.benchmark.setting import Setting
+from mambaloc.benchmark.setting import BenchmarkConfig
 from mambaloc.console import quieten
 
 Measured = TypeVar("Measured")
@@ -44,7 +44,7 @@ class Footprint:
     device_bytes: int
 
 
-def measure_scaling(setting: Setting, frames: Sequence[int], epochs: int = 3) -> list[Footprint]:
+def measure_scaling(setting: BenchmarkConfig, frames: Sequence[int], epochs: int = 3) -> list[Footprint]:
     """Train whole epochs on so many frames of a scene, each in a process of its own.
 
     Args:
@@ -86,7 +86,7 @@ class _EpochClock(L.Callback):
         self.epochs_s.append(now(pl_module.device) - self._start)
 
 
-def _train(setting: Setting, epochs: int) -> Footprint:
+def _train(setting: BenchmarkConfig, epochs: int) -> Footprint:
     system, data = setting.build()
     clock = _EpochClock()
     setting.fit(system, data, clock, max_epochs=epochs)

@@ -17,7 +17,7 @@ from mambaloc.models import LitPoseRegressor, create_model
 
 
 @dataclass(frozen=True)
-class Setting:
+class BenchmarkConfig:
     """A system on a scene, with any setting of a recipe.
 
     Args:
@@ -32,7 +32,7 @@ class Setting:
     data: Mapping[str, Any] = field(default_factory=dict)
     trainer: Mapping[str, Any] = field(default_factory=dict)
 
-    def with_overlay(self, path: Path) -> Setting:
+    def with_overlay(self, path: Path) -> BenchmarkConfig:
         """Put what an overlay says over this; it has nothing but these three sections to say.
 
         Raises:
@@ -75,7 +75,7 @@ def _section(path: Path, said: Mapping[str, Any], name: str) -> Mapping[str, Any
     return section
 
 
-def _trainer(setting: Setting, **options: Any) -> L.Trainer:
+def _trainer(setting: BenchmarkConfig, **options: Any) -> L.Trainer:
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     told = {"accelerator": "cpu", "devices": 1, **setting.trainer, "enable_model_summary": False, **quiet, **options}
     return L.Trainer(**{"max_epochs": 1, **told})

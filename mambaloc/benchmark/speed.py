@@ -19,7 +19,7 @@ from rich.progress import Progress
 from mambaloc.benchmark.clock import StepClock, TrainerClock
 from mambaloc.benchmark.footprint import device_peak_bytes, in_a_process, peak_bytes
 from mambaloc.benchmark.reference import ReferenceLoop, check_loaded, published_form
-from mambaloc.benchmark.setting import Setting
+from mambaloc.benchmark.setting import BenchmarkConfig
 from mambaloc.errors import InputError
 from mambaloc.memory import keep_freed_memory
 from mambaloc.models import LitPoseRegressor
@@ -87,7 +87,9 @@ def times_as_long(theirs: Program, ours: Program) -> list[float]:
     return [other.step_s / own.step_s for other, own in zip(theirs.turns, ours.turns, strict=True)]
 
 
-def measure_speed(setting: Setting, batches: Sequence[int] = (), steps: int = 3, turns: int = 3) -> list[Program]:
+def measure_speed(
+    setting: BenchmarkConfig, batches: Sequence[int] = (), steps: int = 3, turns: int = 3
+) -> list[Program]:
     """Train some steps in each program, batch size and dropout.
 
     Args:
@@ -128,7 +130,7 @@ def _side_by_side(system: LitPoseRegressor, batches: Sequence[int]) -> list[list
     return [[Program(name, batch, dropout, keeps) for name, keeps in ways] for batch in batches for dropout in dropouts]
 
 
-def measure_turn(setting: Setting, program: Program, steps: int) -> Turn:
+def measure_turn(setting: BenchmarkConfig, program: Program, steps: int) -> Turn:
     """Train so many steps and one before them in this process, which keeps its settings: give it one of its own."""
     torch.set_num_threads(1)
     if program.keeps_memory:

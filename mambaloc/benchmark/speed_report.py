@@ -15,7 +15,7 @@ from mambaloc import provenance
 from mambaloc.benchmark.clock import PARTS
 from mambaloc.benchmark.footprint import Footprint, exponent, measure_scaling
 from mambaloc.benchmark.report import new_table
-from mambaloc.benchmark.setting import Setting
+from mambaloc.benchmark.setting import BenchmarkConfig
 from mambaloc.benchmark.speed import OURS, Program, measure_speed, times_as_long
 from mambaloc.benchmark.whole_training import WholeTraining, check_whole_training, measure_whole_training
 from mambaloc.errors import InputError
@@ -33,14 +33,14 @@ class SpeedReport:
         whole: a training to its end, if an error was sought.
     """
 
-    setting: Setting
+    setting: BenchmarkConfig
     programs: list[Program]
     scaling: list[Footprint]
     whole: WholeTraining | None = None
 
 
 def measure_all(
-    setting: Setting,
+    setting: BenchmarkConfig,
     batches: Sequence[int] = (),
     frames: Sequence[int] = (),
     steps: int = 3,
@@ -67,7 +67,7 @@ def measure_all(
     return SpeedReport(setting, programs, scaling, whole)
 
 
-def _check(setting: Setting, frames: Sequence[int], sought_m: float | None) -> None:
+def _check(setting: BenchmarkConfig, frames: Sequence[int], sought_m: float | None) -> None:
     """Check the arguments before anything is measured.
 
     Raises:

@@ -10,7 +10,7 @@ from lightning.pytorch.utilities.types import STEP_OUTPUT
 
 from mambaloc.benchmark.clock import now
 from mambaloc.benchmark.footprint import in_a_process
-from mambaloc.benchmark.setting import Setting
+from mambaloc.benchmark.setting import BenchmarkConfig
 from mambaloc.errors import InputError
 
 
@@ -41,7 +41,7 @@ class WholeTraining:
     selection: str
 
 
-def measure_whole_training(setting: Setting, sought_m: float) -> WholeTraining:
+def measure_whole_training(setting: BenchmarkConfig, sought_m: float) -> WholeTraining:
     """Train as the setting says, from the start of a process to the last step.
 
     Raises:
@@ -51,7 +51,7 @@ def measure_whole_training(setting: Setting, sought_m: float) -> WholeTraining:
     return in_a_process(_train, setting, time.time(), sought_m)
 
 
-def check_whole_training(setting: Setting) -> None:
+def check_whole_training(setting: BenchmarkConfig) -> None:
     """Check whether a setting can be trained to its end.
 
     Raises:
@@ -95,7 +95,7 @@ class _Clock(L.Callback):
         return time.time() - self.started_at - self._validation_s
 
 
-def _train(setting: Setting, started_at: float, sought_m: float) -> WholeTraining:
+def _train(setting: BenchmarkConfig, started_at: float, sought_m: float) -> WholeTraining:
     system, data = setting.build()
     clock = _Clock(started_at, sought_m)
     trainer = setting.fit(system, data, clock, limit_val_batches=1.0, max_steps=setting.trainer.get("max_steps", -1))

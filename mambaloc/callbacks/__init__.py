@@ -9,9 +9,11 @@ from mambaloc.callbacks.time_budget import TimeBudget
 from mambaloc.callbacks.trajectory_plot import TrajectoryPlot
 from mambaloc.callbacks.view_sheet import ViewSheet
 from mambaloc.callbacks.wall_clock import WallClock
-from mambaloc.callbacks.whole_checkpoints import WholeCheckpoints
+from mambaloc.callbacks.whole_checkpoints import AtomicCheckpointIO
+from mambaloc.renamed import renamed
 
 __all__ = [
+    "AtomicCheckpointIO",
     "EarlyStopping",
     "MapBuild",
     "MovedRun",
@@ -21,5 +23,6 @@ __all__ = [
     "TrajectoryPlot",
     "ViewSheet",
     "WallClock",
-    "WholeCheckpoints",
 ]
+
+__getattr__ = renamed(__name__, {"WholeCheckpoints": "AtomicCheckpointIO"})

@@ -12,7 +12,7 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from mambaloc.files import whole_file
 
 
-class WholeCheckpoints(TorchCheckpointIO):
+class AtomicCheckpointIO(TorchCheckpointIO):
     """Write a checkpoint beside its place, then move it there.
 
     Lightning writes it to the temporary folder first. That is often on another disk, from where a move is a copy: one

@@ -67,7 +67,7 @@ def _speed(args: argparse.Namespace) -> None:
         raise InputError(f"{args.out}: the folder {args.out.parent} does not exist; make it first")
     scene = {"dataset": args.dataset, "root": args.root, "scene": args.scene, "validation": "block"}
     system = model_class(args.system).registry_name
-    setting = benchmark.Setting(system, data={**benchmark.PUBLISHED_DATA.get(system, {}), **scene})
+    setting = benchmark.BenchmarkConfig(system, data={**benchmark.PUBLISHED_DATA.get(system, {}), **scene})
     for overlay in args.overlay:
         setting = setting.with_overlay(overlay)
     report = benchmark.measure_all(setting, args.batch, args.frames, args.steps, args.turns, args.reach)

@@ -17,7 +17,7 @@ from mambaloc.images import Image
 from mambaloc.runtime import Localizer
 from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.sources import SourceFrame
-from mambaloc.runtime.video import FILTERS, Followed, follow
+from mambaloc.runtime.video import FILTERS, VideoResult, localize_video
 from mambaloc.viz.rerun_recording import RerunRecording, rerun_recording
 
 
@@ -102,7 +102,7 @@ def _recording(localizer: Localizer, path: Path | None) -> Iterator[RerunRecordi
         yield recording
 
 
-def _localize_frames(localizer: Localizer, args: Namespace, recording: RerunRecording | None) -> Followed:
+def _localize_frames(localizer: Localizer, args: Namespace, recording: RerunRecording | None) -> VideoResult:
     def record(frame: SourceFrame, pose: Localization) -> None:
         image, matrix = frame.image, args.intrinsics
         if args.distorted:
@@ -112,7 +112,7 @@ def _localize_frames(localizer: Localizer, args: Namespace, recording: RerunReco
         assert recording is not None
         recording.add_frame(image, pose, frame.time_s, matrix)
 
-    return follow(
+    return localize_video(
         localizer,
         args.source,
         args.out,

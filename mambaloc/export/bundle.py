@@ -23,7 +23,7 @@ from mambaloc.export.onnx import contract_of_training, export_onnx
 from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
 from mambaloc.export.preprocessing import with_preprocessing
-from mambaloc.export.quantization import EightBit, eight_bit
+from mambaloc.export.quantization import QuantizedModel, eight_bit
 from mambaloc.files import sha256, whole_folder
 from mambaloc.geometry import canonical
 from mambaloc.images import Image, read_image
@@ -51,7 +51,7 @@ class WrittenBundle:
     """
 
     deviations: list[Deviation]
-    int8: EightBit | None
+    int8: QuantizedModel | None
     unsure: str | None
 
 
@@ -132,7 +132,7 @@ def _write_models(
     formats: Sequence[str],
     raw_input: bool,
     uncertainty: UncertaintyHead | None,
-) -> tuple[Contract, EightBit | None]:
+) -> tuple[Contract, QuantizedModel | None]:
     plain = contract_of_training(system, data, uncertainty)
     contract = replace(plain, preprocessing=replace(plain.preprocessing, in_model=raw_input))
     network = folder / MODEL_FILES["onnx"]
@@ -142,7 +142,7 @@ def _write_models(
     models, focal_px = {"onnx": model}, contract.intrinsics[0][0] if contract.intrinsics else None
     if "fp16" in formats:
         models["fp16"] = half_precision(model)
-    if int8 and int8.fits:
+    if int8 and int8.within_tolerance:
         models["int8"] = int8.model
     for name, each in models.items():
         whole = with_preprocessing(each, contract.preprocessing, focal_px) if raw_input else each
@@ -230,7 +230,7 @@ def _write_contract(
     frames: list[dict[str, Any]],
     formats: Sequence[str],
     size_m: float,
-    int8: EightBit | None,
+    int8: QuantizedModel | None,
     described_map: dict[str, Any],
 ) -> None:
     """Write ``contract.json``, last of all files, since it digests them."""
@@ -253,7 +253,7 @@ def _write_contract(
     (folder / CONTRACT_FILE).write_text(json.dumps(bundle, indent=2) + "\n", encoding="utf-8")
 
 
-def _in_figures(int8: EightBit) -> dict[str, Any]:
+def _in_figures(int8: QuantizedModel) -> dict[str, Any]:
     return {
         "layers": int8.kind,
         "position_error_m": int8.position_error_m,

@@ -17,6 +17,7 @@ import onnxruntime
 import torch
 from torch import Tensor, nn
 from torch.export import Dim
+from typing_extensions import deprecated
 
 from mambaloc.data import MultiSceneDataModule, PoseDataModule
 from mambaloc.errors import InputError
@@ -48,16 +49,22 @@ class Parity:
     Args:
         position_m: of positions.
         rotation_deg: of rotations.
-        reach_m: largest distance from the scene's origin in PyTorch's output; float32 rounds in proportion to it.
+        max_norm_m: largest distance from the scene's origin in PyTorch's output; float32 rounds in proportion to it.
         uncertainty: of radii and unfamiliarity, over PyTorch's; 0 for a model without them.
         scene: of scenes' probabilities; 0 for a model that knows one.
     """
 
     position_m: float
     rotation_deg: float
-    reach_m: float
+    max_norm_m: float
     uncertainty: float = 0.0
     scene: float = 0.0
+
+    @property
+    @deprecated("Parity.reach_m is now max_norm_m. The old name is removed in the next release.")
+    def reach_m(self) -> float:
+        """Largest distance from the origin. Deprecated: removed in the next release."""
+        return self.max_norm_m
 
 
 class DeployedNetwork(nn.Module):
@@ -116,7 +123,7 @@ def export_onnx(
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(deployed, contract, partial)
         parity = check_parity(deployed, partial, system.image_size)
-        size_m = max(1.0, _largest_position_m(deployed), parity.reach_m)
+        size_m = max(1.0, _largest_position_m(deployed), parity.max_norm_m)
         is_close = parity.position_m <= tolerance_m * size_m and parity.rotation_deg <= tolerance_deg
         if not (is_close and parity.uncertainty <= _TOLERANCE and parity.scene <= _TOLERANCE):
             raise InputError(
@@ -199,7 +206,7 @@ def check_parity(deployed: DeployedNetwork, path: Path, image_size: tuple[int, i
     """Compare a file with the network it came from, on random images of several cameras in several batch sizes."""
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     generator = torch.Generator().manual_seed(seed)
-    position_m, rotation_deg, reach_m, uncertainty, scene = [], [], [], [torch.zeros(())], [torch.zeros(())]
+    position_m, rotation_deg, max_norm_m, uncertainty, scene = [], [], [], [torch.zeros(())], [torch.zeros(())]
     for batch in _CHECKED_BATCHES:
         inputs = _random_inputs(deployed.network, batch, image_size, generator)
         with torch.inference_mode():
@@ -208,11 +215,11 @@ def check_parity(deployed: DeployedNetwork, path: Path, image_size: tuple[int, i
         actual_m, actual_q, *actual = map(torch.from_numpy, said)
         position_m.append((actual_m - expected_m).norm(dim=-1).max())
         rotation_deg.append(rotation_error_deg(actual_q, expected_q).max())
-        reach_m.append(expected_m.norm(dim=-1).max())
+        max_norm_m.append(expected_m.norm(dim=-1).max())
         if deployed.network.scenes > 1:
             scene.append((actual.pop() - expected.pop()).abs().max())
         uncertainty += [((a - e).abs() / e.clamp_min(1e-6)).max() for a, e in zip(actual, expected, strict=True)]
-    differences = (position_m, rotation_deg, reach_m, uncertainty, scene)
+    differences = (position_m, rotation_deg, max_norm_m, uncertainty, scene)
     return Parity(*(torch.stack(each).max().item() for each in differences))  # NaN stays NaN
 
 

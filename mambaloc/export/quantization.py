@@ -31,7 +31,7 @@ _CALIBRATION_FRAMES = 64
 
 
 @dataclass(frozen=True)
-class EightBit:
+class QuantizedModel:
     """A quantised network and what it lost.
 
     Args:
@@ -51,17 +51,17 @@ class EightBit:
     frames: int
 
     @property
-    def fits(self) -> bool:
+    def within_tolerance(self) -> bool:
         """Whether it lost little enough to be of use."""
         return self.loss < LARGEST_LOSS  # not where it is NaN
 
     def __str__(self) -> str:
         errors = f"median {self.position_error_m:.3f} m and {self.rotation_error_deg:.2f}° on {self.frames} test frames"
         said = f"int8 ({self.kind}): {errors}, {self.loss:+.1%} on float32's at most"
-        return said if self.fits else f"{said}; {LARGEST_LOSS:.0%} is allowed, so it was left out; take fp16"
+        return said if self.within_tolerance else f"{said}; {LARGEST_LOSS:.0%} is allowed, so it was left out; use fp16"
 
 
-def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> EightBit:
+def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> QuantizedModel:
     """Quantise a network after training: all layers if the errors allow it, else without the most sensitive ones.
 
     Args:
@@ -82,8 +82,8 @@ def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> EightBit:
         position_m, rotation_deg = (after[name] for name in ("position_error_m", "rotation_error_deg"))
         ratios = [after[name] / max(before[name], 1e-9) for name in ("position_error_m", "rotation_error_deg")]
         loss = float(np.max(ratios)) - 1  # NaN stays NaN
-        found = EightBit(quantized, kind, position_m, rotation_deg, loss, count)
-        if found.fits:
+        found = QuantizedModel(quantized, kind, position_m, rotation_deg, loss, count)
+        if found.within_tolerance:
             break
     return found
 

@@ -17,8 +17,8 @@ from mambaloc import provenance
 from mambaloc.data.datasets.capture import COLUMNS, FRAMES_FILE, SCENE_FILE, VERSION, VERSION_KEY, WORLD_KEY
 from mambaloc.importing.capture import Camera, Capture
 from mambaloc.importing.checks.agreement import Agreement
-from mambaloc.importing.checks.findings import Finding, Verdict
-from mambaloc.importing.splits.selection import RULE, Chosen, Proposal
+from mambaloc.importing.checks.findings import Finding, ImportStatus
+from mambaloc.importing.splits.selection import RULE, SelectedSplit, SplitCandidate
 from mambaloc.runtime.camera_models import CameraModel, model_to_json, numbers_to_json
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
@@ -54,9 +54,9 @@ class Imported:
     lenses: Mapping[str, Camera]
     split: tuple[str, ...]
     findings: tuple[Finding, ...]
-    verdict: Verdict
-    proposals: tuple[Proposal, ...]
-    chosen: Chosen | None
+    verdict: ImportStatus
+    proposals: tuple[SplitCandidate, ...]
+    chosen: SelectedSplit | None
     left_out: Mapping[str, str]
     agreement: Agreement | None = None
     adjusted: NDArray[np.float64] | None = None

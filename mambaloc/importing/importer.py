@@ -20,7 +20,7 @@ from mambaloc.importing.motion import Motion, motion_of
 from mambaloc.importing.registry import read_capture
 from mambaloc.importing.report import write_report
 from mambaloc.importing.splits.advisor import propose
-from mambaloc.importing.splits.selection import ASKED, Chosen, Proposal, choose
+from mambaloc.importing.splits.selection import ASKED, SelectedSplit, SplitCandidate, choose
 from mambaloc.importing.undistort.images import Written, write_images
 from mambaloc.importing.world import in_its_world
 
@@ -81,8 +81,8 @@ def _checked(written: Written, left_out: Mapping[str, str], asked: str, with_adj
     """Check what was written, and split it."""
     capture = written.capture
     findings = [sanity.check_frames(capture, left_out), sanity.check_missing(capture)]
-    proposals: list[Proposal] = []
-    chosen: Chosen | None = None
+    proposals: list[SplitCandidate] = []
+    chosen: SelectedSplit | None = None
     agreeing: Agreement | None = None
     split = np.full(len(capture.images), "unused", dtype="<U6")
     if not any(finding.is_fatal for finding in findings):

@@ -16,7 +16,7 @@ from mambaloc.importing.checks.conventions import up_of
 from mambaloc.importing.checks.depth import SCALES
 from mambaloc.importing.checks.epipolar import FOCALS, NEAR_PX, Bin
 from mambaloc.importing.motion import motion_of
-from mambaloc.importing.splits.selection import RULE, Proposal
+from mambaloc.importing.splits.selection import RULE, SplitCandidate
 from mambaloc.viz.agreement import draw_agreement
 from mambaloc.viz.capture import draw_capture
 
@@ -102,20 +102,20 @@ def _proposals(imported: Imported) -> Table:
     return table
 
 
-def _told(proposal: Proposal, unit: str) -> dict[str, tuple[float, float, float]]:
+def _told(proposal: SplitCandidate, unit: str) -> dict[str, tuple[float, float, float]]:
     return {unit: proposal.length, "deg": proposal.turn_deg, "steps": proposal.steps}
 
 
-def _counts(proposal: Proposal) -> str:
+def _counts(proposal: SplitCandidate) -> str:
     return "/".join(str(proposal.counts[split]) for split in ("train", "val", "test"))
 
 
-def _quality(proposal: Proposal) -> str:
-    faults = [word for word, holds in (("leaks", not proposal.is_honest), ("far", not proposal.is_learnable)) if holds]
+def _quality(proposal: SplitCandidate) -> str:
+    faults = [word for word, holds in (("leaks", not proposal.is_leak_free), ("far", not proposal.is_covered)) if holds]
     return ", ".join(faults) or "good"
 
 
-def _spans(proposal: Proposal) -> list[str]:
+def _spans(proposal: SplitCandidate) -> list[str]:
     return [f"{_short(b)} ({_short(a)} to {_short(c)})" for a, b, c in _told(proposal, "").values()]
 
 

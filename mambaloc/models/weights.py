@@ -71,8 +71,7 @@ def start_from(network: PoseNetwork, path: str | Path, scenes: Sequence[str] = (
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise InputError(
-            f"model.warm_start: {path}: has another network ({reason}); "
-            "train it with this recipe's model arguments"
+            f"model.warm_start: {path}: has another network ({reason}); train it with this recipe's model arguments"
         ) from None
     return known
 

@@ -23,6 +23,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import deprecated
 
 from mambaloc.errors import InputError
 from mambaloc.runtime.filter_noise import Noise
@@ -44,13 +45,13 @@ class PoseEstimate:
 
     Shape:
         ``position_m`` (3,); ``quaternion`` (4,) unit, wxyz, ``w >= 0``; ``velocity_m_s`` (3,) along the world's axes;
-        ``turn_rad_s`` (3,), the angular velocity about the camera's axes; ``covariance`` (12, 12).
+        ``angular_velocity_rad_s`` (3,), the angular velocity about the camera's axes; ``covariance`` (12, 12).
 
     Args:
         position_m: camera centre in the scene's frame.
         quaternion: its rotation, wxyz.
         velocity_m_s: rate of the position.
-        turn_rad_s: rate of the rotation.
+        angular_velocity_rad_s: rate of the rotation.
         covariance: of the error, as the head of this file says.
         is_outlier: the measured pose was left out.
         begins: nothing before this pose counts: it is one of the first, or a jump was believed here.
@@ -59,10 +60,16 @@ class PoseEstimate:
     position_m: Array
     quaternion: Array
     velocity_m_s: Array
-    turn_rad_s: Array
+    angular_velocity_rad_s: Array
     covariance: Array
     is_outlier: bool = False
     begins: bool = False
+
+    @property
+    @deprecated("PoseEstimate.turn_rad_s is now angular_velocity_rad_s. The old name is removed in the next release.")
+    def turn_rad_s(self) -> Array:
+        """Angular velocity. Deprecated: removed in the next release."""
+        return self.angular_velocity_rad_s
 
 
 class PoseFilter:
@@ -100,13 +107,13 @@ class PoseFilter:
         if self._learns:
             self._learn(measured)
         if self._estimate is None or self._noise is None:
-            estimate = _begun(measured, self._noise or Noise())
+            estimate = _initial(measured, self._noise or Noise())
         else:
-            predicted, _, _ = _predicted(self._estimate, measured.time_s - self._time_s, self._noise)
-            estimate = _corrected(predicted, measured, self._noise)
+            predicted, _, _ = _predict(self._estimate, measured.time_s - self._time_s, self._noise)
+            estimate = _update(predicted, measured, self._noise)
             self._left_out = self._left_out + 1 if estimate.is_outlier else 0
             if self._left_out == _PATIENCE:
-                estimate, self._left_out = _begun(measured, self._noise), 0
+                estimate, self._left_out = _initial(measured, self._noise), 0
         self._time_s, self._estimate = measured.time_s, estimate
         return estimate
 
@@ -140,11 +147,11 @@ def smooth(
     noise = noise or _learned(track)
     smoothed: list[PoseEstimate] = []
     while rest := track[len(smoothed) :]:
-        smoothed += _went_back(_followed(rest, noise), rest, noise)
+        smoothed += _rts_smooth(_filter_track(rest, noise), rest, noise)
     return smoothed
 
 
-def _followed(track: Sequence[_Measured], noise: Noise) -> list[PoseEstimate]:
+def _filter_track(track: Sequence[_Measured], noise: Noise) -> list[PoseEstimate]:
     """Filter until a jump; the poses left out before it was believed are the jump's."""
     causal = PoseFilter(noise)
     estimates: list[PoseEstimate] = []
@@ -156,19 +163,22 @@ def _followed(track: Sequence[_Measured], noise: Noise) -> list[PoseEstimate]:
     return estimates
 
 
-def _went_back(filtered: Sequence[PoseEstimate], track: Sequence[_Measured], noise: Noise) -> list[PoseEstimate]:
+def _rts_smooth(filtered: Sequence[PoseEstimate], track: Sequence[_Measured], noise: Noise) -> list[PoseEstimate]:
     """The backward pass of Rauch, Tung and Striebel, on the error of each pose as filtered."""
     smoothed = [filtered[-1]]
     for k in range(len(filtered) - 2, -1, -1):
         before, after = filtered[k], smoothed[-1]
-        predicted, motion, wander = _predicted(before, track[k + 1].time_s - track[k].time_s, noise)
+        predicted, motion, process_noise = _predict(before, track[k + 1].time_s - track[k].time_s, noise)
         gain = np.linalg.solve(predicted.covariance, motion @ before.covariance).T
         kept = np.eye(12) - gain @ motion
-        covariance = kept @ before.covariance @ kept.T + gain @ (after.covariance + wander) @ gain.T
+        covariance = kept @ before.covariance @ kept.T + gain @ (after.covariance + process_noise) @ gain.T
         turned = rotation_vector_between(predicted.quaternion, after.quaternion)
-        rates = after.velocity_m_s - predicted.velocity_m_s, after.turn_rad_s - predicted.turn_rad_s
+        rates = (
+            after.velocity_m_s - predicted.velocity_m_s,
+            after.angular_velocity_rad_s - predicted.angular_velocity_rad_s,
+        )
         error = np.concatenate((after.position_m - predicted.position_m, rates[0], turned, rates[1]))
-        smoothed.append(_moved(before, gain @ error, covariance))
+        smoothed.append(_boxplus(before, gain @ error, covariance))
     return smoothed[::-1]
 
 
@@ -198,7 +208,7 @@ def _learned(track: Sequence[_Measured]) -> Noise:
     return Noise.learned(*map(np.array, zip(*finite, strict=True))) if len(finite) >= _LEARNT_EVERY else Noise()
 
 
-def _begun(measured: _Measured, noise: Noise) -> PoseEstimate:
+def _initial(measured: _Measured, noise: Noise) -> PoseEstimate:
     if not measured.is_finite:
         raise InputError(f"pose at {measured.time_s} s: not finite, and the filter would begin with it; leave it out")
     deviations = noise.position_m, _FIRST_SPEED_M_S, np.radians(noise.rotation_deg), _FIRST_TURN_RAD_S
@@ -206,28 +216,28 @@ def _begun(measured: _Measured, noise: Noise) -> PoseEstimate:
     return PoseEstimate(measured.position_m, canonical(measured.quaternion), still, still, covariance, begins=True)
 
 
-def _predicted(estimate: PoseEstimate, step_s: float, noise: Noise) -> tuple[PoseEstimate, Array, Array]:
+def _predict(estimate: PoseEstimate, step_s: float, noise: Noise) -> tuple[PoseEstimate, Array, Array]:
     """The pose ``step_s`` later, how errors move to it, and the covariance that motion adds; both (12, 12)."""
-    turned = estimate.turn_rad_s * step_s
-    motion, wander = np.eye(12), np.zeros((12, 12))
+    turned = estimate.angular_velocity_rad_s * step_s
+    motion, process_noise = np.eye(12), np.zeros((12, 12))
     motion[_ROTATION, _ROTATION] = cv2.Rodrigues(-turned)[0]
     motion[_MEASURED, _RATES] = step_s
     white = np.repeat(np.square((noise.acceleration_m_s2, np.radians(noise.acceleration_deg_s2))), 3)
-    wander[_MEASURED, _MEASURED] = step_s**3 / 3 * white  # integrated over the step
-    wander[_MEASURED, _RATES] = wander[_RATES, _MEASURED] = step_s**2 / 2 * white
-    wander[_RATES, _RATES] = step_s * white
+    process_noise[_MEASURED, _MEASURED] = step_s**3 / 3 * white  # integrated over the step
+    process_noise[_MEASURED, _RATES] = process_noise[_RATES, _MEASURED] = step_s**2 / 2 * white
+    process_noise[_RATES, _RATES] = step_s * white
     moved = replace(
         estimate,
         position_m=estimate.position_m + step_s * estimate.velocity_m_s,
         quaternion=canonical(multiply(estimate.quaternion, quaternion_from_rotation_vector(turned))),
-        covariance=motion @ estimate.covariance @ motion.T + wander,
+        covariance=motion @ estimate.covariance @ motion.T + process_noise,
         is_outlier=False,
         begins=False,
     )
-    return moved, motion, wander
+    return moved, motion, process_noise
 
 
-def _corrected(predicted: PoseEstimate, measured: _Measured, noise: Noise) -> PoseEstimate:
+def _update(predicted: PoseEstimate, measured: _Measured, noise: Noise) -> PoseEstimate:
     """Take the measured pose in, unless it is an outlier."""
     turned = rotation_vector_between(predicted.quaternion, measured.quaternion)
     innovation = np.concatenate((measured.position_m - predicted.position_m, turned))
@@ -239,16 +249,16 @@ def _corrected(predicted: PoseEstimate, measured: _Measured, noise: Noise) -> Po
     kept = np.eye(12)
     kept[:, _MEASURED] -= gain
     covariance = kept @ predicted.covariance @ kept.T + gain @ errors @ gain.T  # Joseph's form: never negative
-    return _moved(predicted, gain @ innovation, covariance)
+    return _boxplus(predicted, gain @ innovation, covariance)
 
 
-def _moved(estimate: PoseEstimate, error: Array, covariance: Array) -> PoseEstimate:
+def _boxplus(estimate: PoseEstimate, error: Array, covariance: Array) -> PoseEstimate:
     """Put an error (12,) into a state; the covariance keeps its axes, to first order in the rotation (Solà's 6.3)."""
     return replace(
         estimate,
         position_m=estimate.position_m + error[_POSITION],
         velocity_m_s=estimate.velocity_m_s + error[_VELOCITY],
         quaternion=canonical(multiply(estimate.quaternion, quaternion_from_rotation_vector(error[_ROTATION]))),
-        turn_rad_s=estimate.turn_rad_s + error[_TURN],
+        angular_velocity_rad_s=estimate.angular_velocity_rad_s + error[_TURN],
         covariance=(covariance + covariance.T) / 2,
     )

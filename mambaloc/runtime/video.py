@@ -24,7 +24,7 @@ FILTERS = ("causal", "smooth")
 
 
 @dataclass(frozen=True)
-class Followed:
+class VideoResult:
     """What became of a source's frames.
 
     Args:
@@ -63,7 +63,7 @@ class Followed:
         return f"{line}\nnine of ten within {metres:.2g} m and {degrees:.2g}°{unfamiliar}"
 
 
-def follow(
+def localize_video(
     localizer: Localizer,
     source: str,
     out: Path,
@@ -72,7 +72,7 @@ def follow(
     counts: Counts | None = None,
     is_distorted: bool = False,
     on_frame: Callable[[SourceFrame, Localization], None] | None = None,
-) -> Followed:
+) -> VideoResult:
     """Localize every frame of a source with a progress bar on stderr, and write a TUM trajectory.
 
     Ctrl-C ends it; what was found is written then, and also where a frame cannot be localized. The trajectory's times
@@ -122,17 +122,17 @@ def follow(
     return summarize(localizer, [pose for _, pose in found], outliers)
 
 
-def summarize(localizer: Localizer, found: Sequence[Localization], outliers: int | None = None) -> Followed:
+def summarize(localizer: Localizer, found: Sequence[Localization], outliers: int | None = None) -> VideoResult:
     """Say what became of frames.
 
     Args:
         localizer: that found their poses.
         found: a frame's each, at least one with a pose.
-        outliers: as of :class:`Followed`.
+        outliers: as of :class:`VideoResult`.
     """
     poses = [pose for pose in found if pose.source is not None]
     has_both = localizer.contract is not None and localizer.sparse_map is not None
-    return Followed(
+    return VideoResult(
         localizer.scene,
         len(poses),
         len(found) - len(poses),

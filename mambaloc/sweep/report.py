@@ -13,7 +13,7 @@ from mambaloc.sweep.formats import Section, as_csv, as_latex, as_markdown, as_pa
 from mambaloc.sweep.paper import paper_tables
 from mambaloc.sweep.plots import NAMES, plots_of
 from mambaloc.sweep.store import Store, StoredTrial
-from mambaloc.sweep.summary import ERRORS, Difference, Figure, Row, differences, history, rows_of
+from mambaloc.sweep.summary import ERRORS, Difference, Estimate, Row, differences, history, rows_of
 
 Table = list[list[str]]
 
@@ -194,7 +194,7 @@ def _failures(failed: Sequence[StoredTrial]) -> Section:
     return Section("failed", "Failed", "", [header, *([*trial.labels.values(), str(trial.error)] for trial in failed)])
 
 
-def _signed(figure: Figure) -> str:
+def _signed(figure: Estimate) -> str:
     sure = "" if figure.is_sure else ", may be 0"
     return f"{figure.mean:+.3f} ({figure.low:+.3f} to {figure.high:+.3f}{sure})"
 

@@ -25,7 +25,7 @@ ERRORS = {"position_error_m": "m", "rotation_error_deg": "°"}
 
 
 @dataclass(frozen=True)
-class Figure:
+class Estimate:
     """A mean over seeds of medians over frames, or a difference of two such, with its 95 % interval.
 
     Args:
@@ -65,7 +65,7 @@ class Row:
 
     labels: dict[str, str]
     seeds: tuple[str, ...]
-    errors: dict[str, Figure]
+    errors: dict[str, Estimate]
     train_s: tuple[float, ...]
     steps: tuple[int, ...]
     train_frames: int
@@ -73,7 +73,7 @@ class Row:
     data: str
     selection: str
     references: dict[str, dict[str, float]]
-    both: dict[str, Figure] | None
+    both: dict[str, Estimate] | None
     trials: tuple[dict[str, Any], ...]
 
     @property
@@ -99,7 +99,7 @@ class Difference:
     """
 
     labels: dict[str, str]
-    errors: dict[str, Figure]
+    errors: dict[str, Estimate]
     step_ratio: tuple[float, ...]
     reach_ratio: tuple[float, ...]
 
@@ -225,7 +225,7 @@ def _row(labels: dict[str, str], group: list[StoredTrial], epoch: str) -> Row:
     )
 
 
-def _figures(results: list[dict[str, Any]], rows: NDArray[np.int64]) -> dict[str, Figure]:
+def _figures(results: list[dict[str, Any]], rows: NDArray[np.int64]) -> dict[str, Estimate]:
     return {name: _figure([_medians(result, name, rows) for result in results]) for name in ERRORS}
 
 
@@ -269,10 +269,10 @@ def _difference(labels: dict[str, str], pairs: list[Pair]) -> Difference:
     return Difference(labels, errors, tuple(_step_s(after) / _step_s(before) for before, after in pairs), reach)
 
 
-def _figure(medians: list[NDArray[np.float64]]) -> Figure:
+def _figure(medians: list[NDArray[np.float64]]) -> Estimate:
     mean = np.mean(medians, axis=0)
     low, high = np.quantile(mean[1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Figure(float(mean[0]), float(low), float(high))
+    return Estimate(float(mean[0]), float(low), float(high))
 
 
 def _step_s(result: dict[str, Any]) -> float:

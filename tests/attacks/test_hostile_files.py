@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mambaloc.benchmark import Setting
+from mambaloc.benchmark import BenchmarkConfig
 from mambaloc.cli import recipe_arguments
 from mambaloc.data.cameras import known_cameras, known_or_assumed_cameras
 from mambaloc.data.datasets import cambridge, seven_scenes
@@ -29,7 +29,7 @@ from mambaloc.images import decode_image
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.registry import read_capture
 from mambaloc.models.weights import read_checkpoint
-from mambaloc.rendering import read_pose_table, shots_of_sequences, write_cambridge
+from mambaloc.rendering import frames_of_sequences, read_pose_table, write_cambridge
 from mambaloc.rendering.trajectories import smooth_trajectory
 from mambaloc.runtime import Contract, Localizer
 from mambaloc.runtime.bundle import verify_bundle
@@ -95,6 +95,10 @@ def damages(draw) -> Callable[[bytes], bytes]:
     return damage
 
 
+def _overlaid(folder: Path) -> BenchmarkConfig:
+    return BenchmarkConfig("mambaloc").with_overlay(folder / "overlay.yaml")
+
+
 @pytest.fixture(scope="module")
 def frames_7scenes(tmp_path_factory, scenes):
     folder = shutil.copytree(scenes / "heads", tmp_path_factory.mktemp("hostile") / "heads")
@@ -156,7 +160,7 @@ def test_pose_table(tmp_path, fed):
 
 def test_points_of_a_model(tmp_path, fed):
     walks = {n: smooth_trajectory(4, n, ((-1.0, -1.0, 1.2), (1.0, 1.0, 1.6))) for n in (1, 2)}
-    shots = shots_of_sequences(walks, test=(2,), image="seq{sequence}/frame{frame:05d}.png")
+    shots = frames_of_sequences(walks, test=(2,), image="seq{sequence}/frame{frame:05d}.png")
     folder = write_cambridge(tmp_path, "Yard", shots, size=(48, 36), points=True)
     frames = cambridge.read_split(folder, "train", BadFrames())
     cameras = known_cameras("cambridge", folder, frames)
@@ -229,8 +233,8 @@ LABEL = "seq1/frame00001.png 1 2 3 1 0 0 0"
         ("dataset_train.txt", cambridge.read_split, "\n\n\n" + "x" * 10**7),
         ("poses.csv", lambda folder, *_: read_pose_table(folder / "poses.csv", "a", "7scenes"), POSES + "\n" * 10**6),
         ("poses.csv", lambda folder, *_: read_pose_table(folder / "poses.csv", "a", "7scenes"), POSES + "a" * 10**6),
-        ("overlay.yaml", lambda folder, *_: Setting("mambaloc").with_overlay(folder / "overlay.yaml"), "[" * 10**5),
-        ("overlay.yaml", lambda folder, *_: Setting("mambaloc").with_overlay(folder / "overlay.yaml"), LAUGHS),
+        ("overlay.yaml", lambda folder, *_: _overlaid(folder), "[" * 10**5),
+        ("overlay.yaml", lambda folder, *_: _overlaid(folder), LAUGHS),
         ("recipe.yaml", lambda folder, *_: recipe_arguments([str(folder / "recipe.yaml")]), LAUGHS),
         ("recipe.yaml", lambda folder, *_: recipe_arguments([str(folder / "recipe.yaml")]), "model: &a [*a]"),
         ("sweep.yaml", lambda folder, *_: read_sweep(folder / "sweep.yaml"), "a: {" * 10**5),
@@ -262,7 +266,7 @@ def test_pictures(suffix, scenes, tmp_path, fed):
 
 def test_overlays(tmp_path, fed):
     overlay = shutil.copy(REPOSITORY / "recipes/overlays/redkitchen_blocks.yaml", tmp_path)
-    fed("overlay", lambda path: Setting("mambaloc").with_overlay(path), Path(overlay))
+    fed("overlay", lambda path: BenchmarkConfig("mambaloc").with_overlay(path), Path(overlay))
 
 
 def test_sweeps(tmp_path, fed):

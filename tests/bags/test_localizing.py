@@ -169,7 +169,7 @@ def test_poses_of_the_robot_are_written_by_its_transforms(drive, tmp_path):
     ("options", "says"),
     [
         (["--out", "poses.tum"], "--out poses.tum: a bag's poses go into a bag"),
-        (["--out", "found", "--filter", "causal"], "--filter causal: a bag's poses are for a robot's own filter"),
+        (["--out", "found", "--filter", "causal"], "--filter causal: a bag's poses are not filtered"),
         (["--out", "found", "--topic", "/up"], "--topic /up"),
         (["--out", "found", "--pose-frame", "arm"], "no transform links the frames 'camera_optical' and 'arm'"),
         (["--out", "."], "already exists"),

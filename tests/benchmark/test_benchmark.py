@@ -32,7 +32,7 @@ def test_latency_is_timed_in_turns(monkeypatch):
     ("kwargs", "message"),
     [
         ({"repetitions": 3}, "--repetitions 3"),
-        ({"device": "cuda"}, "--device cuda: not here; choose one of cpu"),
+        ({"device": "cuda"}, "--device cuda: not available; choose one of cpu"),
         ({"device": "gpu"}, "gpu"),
     ],
 )

@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 
 from mambaloc.benchmark import (
-    Setting,
+    BenchmarkConfig,
     SpeedReport,
     footprint,
     measure_all,
@@ -34,7 +34,7 @@ SMALL = {"dim": 32, "heads": 4, "encoder_layers": 2, "feedforward": 32, "head_hi
 @pytest.fixture(scope="module")
 def setting(scenes):
     scene = {"dataset": "7scenes", "root": str(scenes), "image_size": 32, "short_side": 36, "batch_size": 4}
-    return Setting("mambaloc", {"backbone": TINY_BACKBONE, **SMALL}, {**scene, "validation": "sequences"})
+    return BenchmarkConfig("mambaloc", {"backbone": TINY_BACKBONE, **SMALL}, {**scene, "validation": "sequences"})
 
 
 def test_a_clock_counts_computing_not_waiting():
@@ -63,7 +63,7 @@ def test_ratios_by_hand(capsys):
     assert times_as_long(theirs, ours) == [2, 1.5, 3]
     as_it_comes, other = (replace(theirs, keeps_memory=False), program(OURS, [9.0], 7, dropout=0.0))
     assert not theirs.is_beside(other)
-    print_report(SpeedReport(Setting("atloc"), [ours, theirs, as_it_comes], []), "this machine")
+    print_report(SpeedReport(BenchmarkConfig("atloc"), [ours, theirs, as_it_comes], []), "this machine")
     said = capsys.readouterr().out
     assert "A step of 8 images, attention dropout 0.1" in said
     rows = [" ".join(line.split()) for line in said.splitlines()]
@@ -94,7 +94,7 @@ def test_peak_memory_grows_with_what_is_held():
 def test_overlays_say_model_data_and_trainer(tmp_path):
     overlay = tmp_path / "o.yaml"
     overlay.write_text("model: {init_args: {dim: 8}}\ndata: {batch_size: 2}\ntrainer: {precision: bf16-mixed}\n")
-    setting = Setting("mambaloc", {"dim": 4, "heads": 2}, {"short_side": 9}).with_overlay(overlay)
+    setting = BenchmarkConfig("mambaloc", {"dim": 4, "heads": 2}, {"short_side": 9}).with_overlay(overlay)
     assert setting.model == {"dim": 8, "heads": 2}
     assert setting.data == {"short_side": 9, "batch_size": 2}
     assert setting.trainer == {"precision": "bf16-mixed"}
@@ -106,7 +106,7 @@ def test_overlays_say_model_data_and_trainer(tmp_path):
     [
         (None, "cannot be read"),
         ("{", "is not YAML"),
-        ("- 1", "says nothing of model"),
+        ("- 1", "sets nothing of model"),
         ("early_stopping: 1", "nothing"),
     ],
 )
@@ -115,7 +115,7 @@ def test_no_overlay(text, message, tmp_path):
     if text is not None:
         path.write_text(text)
     with pytest.raises(InputError, match=message):
-        Setting("mambaloc").with_overlay(path)
+        BenchmarkConfig("mambaloc").with_overlay(path)
 
 
 def test_speed_needs_frames(setting):
@@ -225,13 +225,13 @@ def test_processes_of_their_own(setting):
 )
 def test_a_training_that_reaches_nothing(data, trainer, message):
     with pytest.raises(InputError, match=f"--reach: {message}"):
-        measure_whole_training(Setting("mambaloc", {}, data, trainer), 0.1)
+        measure_whole_training(BenchmarkConfig("mambaloc", {}, data, trainer), 0.1)
 
 
 def test_a_system_without_a_published_form_is_measured_alone(setting, monkeypatch):
     monkeypatch.setattr(speed, "in_a_process", lambda measure, *args: measure(*args))
     threads = torch.get_num_threads()
-    student = Setting("student", {"backbone": TINY_BACKBONE, "width": 16}, setting.data)
+    student = BenchmarkConfig("student", {"backbone": TINY_BACKBONE, "width": 16}, setting.data)
     (alone,) = measure_speed(student, steps=1, turns=1)
     torch.set_num_threads(threads)
     assert (alone.name, alone.batch, alone.attention_dropout) == (OURS, 4, None)

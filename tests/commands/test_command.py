@@ -45,7 +45,7 @@ def test_the_list_of_commands_needs_no_torch():
 
 
 @pytest.mark.parametrize(
-    ("word", "hint"), [("trian", "there is no such command. Did you mean train?"), ("x", "Choose one of train, eval")]
+    ("word", "hint"), [("trian", "no such command. Did you mean train?"), ("x", "Choose one of train, eval")]
 )
 def test_an_unknown_command(word, hint, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
@@ -59,6 +59,6 @@ def test_recipes_by_name(monkeypatch, tmp_path):
     assert recipes.recipe_path("recipes/overlays/gis.yaml") == ROOT / "recipes/overlays/gis.yaml"
     (tmp_path / "quickstart").write_text("model: {}")
     assert recipes.recipe_path("quickstart") == Path("quickstart")  # a file of the user's comes first
-    with pytest.raises(InputError, match=r"^quikstart: there is no such recipe\. Did you mean quickstart\?$"):
+    with pytest.raises(InputError, match=r"^quikstart: no such recipe\. Did you mean quickstart\?$"):
         recipes.recipe_path("quikstart")
     assert {"quickstart", "my_scene", "overlays/gis"} <= set(recipes.list_recipes())

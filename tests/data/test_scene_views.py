@@ -19,7 +19,7 @@ from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.capture import COLUMNS
 from mambaloc.data.views import MixedSampler
 from mambaloc.errors import InputError, InputWarning
-from mambaloc.rendering import embedded_room, embedded_walk, render, shots_of_sequences
+from mambaloc.rendering import embedded_room, embedded_walk, frames_of_sequences, render
 from mambaloc.rendering.scenes.layouts import write_7scenes
 from mambaloc.synthesis import gate
 from mambaloc.synthesis import views as making_views
@@ -39,7 +39,7 @@ def room_with_depth(made_once):
 
     def write(root):
         walks = {n: embedded_walk(count, n, 0.0, 360 / count) for n, count in ((1, TRAIN), (2, VAL), (3, TEST))}
-        shots = shots_of_sequences(walks, {3})
+        shots = frames_of_sequences(walks, {3})
         write_7scenes(root, "room", shots, room=embedded_room(), size=SIZE, depth=True, depth_every=2)
 
     return made_once("room_with_depth", write)
@@ -298,7 +298,7 @@ def test_bad_depth_frames_are_named_and_left_out(make, room_with_depth, tmp_path
             f"{small}: depth is not 96x72 as most depth frames are. {without}",
             f"{empty}: depth has no measured pixel. {without}",
             f"{thousandth}: depth is 0.00077 times that of most frames. {without}",
-            f"{truncated}: depth is no whole 16-bit PNG of one channel. {without}",
+            f"{truncated}: depth is not a complete 16-bit PNG of one channel. {without}",
         ]
     )
     assert data.describe()["views"]["depth_frames"] == TRAIN // 2 - 4
@@ -366,7 +366,7 @@ def test_poor_views_are_left_out_and_the_training_goes_on(make, tmp_path, monkey
         ({"views": -1}, "data.views -1: must be 0 or more"),
         ({"view_depth": "lidar"}, "data.view_depth 'lidar': choose one of auto, sensor, images"),
         ({"view_share": 1.0}, "data.view_share 1: must be 0 or more and less than 1"),
-        ({"batch_size": 1}, "data.batch_size 1: has no room for a frame and a view"),
+        ({"batch_size": 1}, "data.batch_size 1: is too small for a frame and a view"),
     ],
 )
 def test_mistakes_are_told_in_one_line(make, options, message):
@@ -392,7 +392,7 @@ def test_assumed_camera_is_said_once(make, room_with_depth, tmp_path):
     options = {"root": root, "cache_dir": str(tmp_path), "validation": "marked", "val_sequences": None}
     data, said = lines_of(make, **options)
     assert len(said) == 1
-    assert "does not say focal length and centre of camera 'colour'" in said[0]
+    assert "has no focal length and centre of camera 'colour'" in said[0]
     assert said[0].endswith("A focal length of 0.87 of the images' longer side is assumed.")
     assert data.describe()["views"]["depth_frames"] == TRAIN // 2
 

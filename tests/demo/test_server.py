@@ -170,6 +170,6 @@ def test_the_address_is_one_of_this_machine():
     try:
         address = lan_address()
     except InputError:
-        pytest.skip("this machine is on no network")
+        pytest.skip("this machine has no network")
     with socket.socket() as here:
         here.bind((address, 0))

@@ -70,7 +70,7 @@ def test_what_is_refused(bundle, site, tmp_path):
     refused("no video", bundle, tmp_path / "site", tmp_path / "film.md")
     changed = shutil.copytree(bundle, tmp_path / "changed")
     (changed / "trajectory.json").write_text("{}")
-    refused("is not the file that the bundle was written with", changed, tmp_path / "site")
+    refused("has another sha256 than the contract", changed, tmp_path / "site")
 
 
 def test_without_npm_its_name_is_told(bundle, tmp_path, monkeypatch):

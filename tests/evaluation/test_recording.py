@@ -54,6 +54,6 @@ def test_a_recording_has_the_rows_of_the_predictions(trained_with_map, tmp_path,
 
 def test_a_wrong_name_is_told_before_anything_is_measured(trained_with_map, tmp_path):
     checkpoint = Checkpoint.read(trained_with_map / "checkpoints/last.ckpt")
-    with pytest.raises(InputError, match=r"--rerun .*a\.txt: is not a recording's name"):
+    with pytest.raises(InputError, match=r"--rerun .*a\.txt: is not the name of a recording"):
         evaluate_checkpoint(checkpoint, tmp_path, accelerator="cpu", rerun=tmp_path / "a.txt")
     assert not list(tmp_path.iterdir())

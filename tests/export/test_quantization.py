@@ -51,7 +51,7 @@ def test_medians_in_onnx_runtime_are_those_of_an_evaluation(network, student, da
 
 
 def test_eight_bits_are_a_quarter_and_find_nearly_the_same(int8, network):
-    assert int8.fits
+    assert int8.within_tolerance
     assert int8.kind == "all layers"
     assert int8.loss < 0.1
     assert int8.frames == 8
@@ -71,7 +71,7 @@ def test_what_is_kept_when_all_layers_lose_too_much(network, data, monkeypatch):
     monkeypatch.setattr(quantisation, "LARGEST_LOSS", -1.0)  # nothing can be so good
     found = eight_bit(network, data)
     assert found.kind == "mixed"
-    assert not found.fits
+    assert not found.within_tolerance
     assert "left out" in str(found)
     kept = sensitive_nodes(quantisation._prepared(network).graph)
     quantized = {name for node in found.model.graph.node if node.name in kept for name in node.input}
@@ -105,7 +105,7 @@ def test_a_bundle_leaves_out_what_loses_too_much(student, data, tmp_path, monkey
     monkeypatch.setattr(quantisation, "LARGEST_LOSS", -1.0)
     written = write_bundle(student, data, tmp_path / "bundle", ("onnx", "int8"))
     assert [each.file for each in written.deviations] == ["model.onnx"]
-    assert not written.int8.fits
+    assert not written.int8.within_tolerance
     assert not (tmp_path / "bundle/model.int8.onnx").exists()
     with pytest.raises(InputError, match="nothing to write: int8"):
         write_bundle(student, data, tmp_path / "other", ("int8",))

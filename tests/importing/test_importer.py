@@ -233,12 +233,12 @@ def test_the_tool_says_what_it_found(rendered_once, tmp_path, capsys):
     [
         (["{tmp}/nothing", "--out", "{tmp}/a"], "there is no such file or folder"),
         (["{room}", "--out", "{room}"], "already exists; remove it"),
-        (["{room}", "--out", "{tmp}/a", "--format", "tango"], "--format tango: there is none; choose one of"),
+        (["{room}", "--out", "{tmp}/a", "--format", "tango"], "unknown --format tango; choose one of"),
         (["{room}", "--out", "{tmp}/a", "--metres-per-unit", "0"], "--metres-per-unit 0.0: give a number"),
         (["{room}", "--out", "{tmp}/a", "--metres-per-unit", "nan"], "--metres-per-unit nan: give a number"),
         (["{room}", "--out", "{tmp}/a", "--split", "given"], "--split given: this capture has no split of its own"),
         (["{room}", "--out", "{tmp}/a", "--split", "sequence"], "this capture has one sequence; choose one of auto"),
-        (["{tmp}", "--out", "{tmp}/a"], "looks like no format that is known"),
+        (["{tmp}", "--out", "{tmp}/a"], "the format is not recognized"),
         (["{room}", "--out", "{tmp}/file/a"], "choose another folder with --out"),
     ],
 )

@@ -264,7 +264,7 @@ def test_wrong_uses_of_distorted_with_a_map_end_in_one_line(
     for words, says in (
         ((map_of_den, "--add", queries / "stored"), "the lens of its images is not known"),
         ((mapped, "--add", imported_once), "a scene's images have no distortion. Leave out --distorted."),
-        ((mapped,), "--distorted: is of what --add adds. Leave it out."),
+        ((mapped,), "--distorted: applies to --add alone. Leave it out."),
         ((mapped, "--add", queries / "stored", "--intrinsics", "140,140,80,60"), "not allowed with"),
     ):
         with pytest.raises(SystemExit) as ended:

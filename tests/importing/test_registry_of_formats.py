@@ -127,7 +127,7 @@ def test_files_are_told_by_their_suffix(tmp_path, kind, name):
 )
 def test_a_stranger_is_taken_for_none(tmp_path, refused, files):
     assert detected(make(tmp_path, files)) is None
-    refused(read_capture, tmp_path, "looks like no format that is known")
+    refused(read_capture, tmp_path, "the format is not recognized")
 
 
 def test_every_format_is_tried_here():

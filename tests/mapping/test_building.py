@@ -135,7 +135,7 @@ def _frames(walk, **changes):
 
 
 def test_too_few_frames_are_refused(walk):
-    with pytest.raises(InputError, match=r"needs two frames or more, and it has 1"):
+    with pytest.raises(InputError, match=r"needs two frames or more, but it has 1"):
         build_map(walk.frames.select(np.array([0])), SETTINGS, "room")
 
 

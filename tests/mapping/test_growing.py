@@ -128,7 +128,7 @@ def test_the_same_name_is_not_added_twice(growths, walk):
     grown = growths[False].sparse_map
     with pytest.raises(InputError, match=r"second: is in the map already\. .* --name"):
         add_frames(grown, _new(grown, walk, ROWS[:2], False), "second", 20)
-    with pytest.raises(InputError, match=r"^poses: is a name that the map itself uses\. Choose another --name\."):
+    with pytest.raises(InputError, match=r"^poses: is the name of the map's own frames\. Choose another --name\."):
         add_frames(grown, _new(grown, walk, ROWS[:2], False), "poses", 20)
 
 

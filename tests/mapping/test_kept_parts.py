@@ -103,5 +103,5 @@ def test_a_damaged_part_is_named_in_a_line(frames, tmp_path):
     data[len(data) // 2] ^= 1
     for damaged in (bytes(data), data[:99], b""):
         part.write_bytes(damaged)
-        with pytest.raises(InputError, match=r"arrays\.npz: is damaged \(.*\)\. Remove .*, and it is made again\.$"):
+        with pytest.raises(InputError, match=r"arrays\.npz: is damaged \(.*\)\. Remove .* to have it made again\.$"):
             build_map(frames, SETTINGS, "room")

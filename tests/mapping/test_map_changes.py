@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from mambaloc.images import read_image
-from mambaloc.rendering import embedded_room, shots_of_sequences, write_7scenes
+from mambaloc.rendering import embedded_room, frames_of_sequences, write_7scenes
 from mambaloc.runtime.maps import SparseMap
 
 ROOT = Path(__file__).parents[2]
@@ -44,7 +44,7 @@ def den(walk, tmp_path_factory):
     """A recipe of a scene whose three test frames the map knows in part."""
     root = tmp_path_factory.mktemp("scenes")
     walks = {1: walk.frames.world_from_cam[:2], 2: walk.frames.world_from_cam[[5, 41, 45]]}
-    write_7scenes(root, "den", shots_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
+    write_7scenes(root, "den", frames_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
     recipe = root / "den.yaml"
     recipe.write_text(yaml.safe_dump({"scene": "den", "root": str(root), "ransac_seeds": [0]}))
     return recipe
@@ -78,17 +78,17 @@ def test_pictures_are_added_measured_and_removed_again(folder, pictures, den, tm
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--add", "{pictures}"], r"map\.safetensors: is not overwritten unasked\. Give --out FOLDER, which may be"),
+        (["--add", "{pictures}"], r"map\.safetensors: would be overwritten\. Give --out FOLDER, which may be"),
         (
             ["--remove", "attic", "--out", "{out}"],
             r"attic: is not in the map of room\. Choose one of its sessions: none",
         ),
         (["--add", "{empty}", "--out", "{out}"], r"contains no image"),
         (["--add", "{out}/no.mp4", "--out", "{out}"], r"no such file"),
-        (["--remove", "attic", "--out", "{out}", "--name", "attic"], r"--name: is of what --add adds\. Leave it out"),
-        (["--intrinsics", "100,100,80,60"], r"--intrinsics: is of what --add adds\. Leave it out"),
-        (["--add", "{pictures}", "--out", "{out}", "--width", "100"], r"is built already\. Leave out --width"),
-        (["--test", "{den}", "--points", "colmap"], r"is built already\. Leave out --points"),
+        (["--remove", "attic", "--out", "{out}", "--name", "attic"], r"--name: applies to --add alone\. Leave it out"),
+        (["--intrinsics", "100,100,80,60"], r"--intrinsics: applies to --add alone\. Leave it out"),
+        (["--add", "{pictures}", "--out", "{out}", "--width", "100"], r"exists already\. Leave out --width"),
+        (["--test", "{den}", "--points", "colmap"], r"exists already\. Leave out --points"),
         (["--test", "{out}/no.yaml"], r"no\.yaml: cannot be read"),
         (["--add", "{strange}", "--out", "{out}"], r"strange: the map finds none of 3 frames\. Check that they show"),
         (["--add", "{den}", "--out", "{out}", "--intrinsics", "100,100,80,60"], r"Leave out --intrinsics"),

@@ -100,7 +100,7 @@ def test_a_system_without_arguments_of_a_backbone(best):
     """Evaluating it with --retrieval ends in one line, as for a backbone that started from scratch."""
     fixed = replace(best, stored={**best.stored, "hyper_parameters": {"lr": 0.001}})
     assert set(fixed.backbone_arguments.values()) == {None}
-    with pytest.raises(InputError, match="--retrieval: this backbone started from scratch"):
+    with pytest.raises(InputError, match="--retrieval: needs a backbone that started from pretrained weights"):
         _first_backbone(fixed)
 
 

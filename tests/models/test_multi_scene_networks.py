@@ -58,9 +58,9 @@ def name(request):
 def test_the_others_know_one_scene_and_say_so():
     others = [each for each in list_models() if each not in SYSTEMS]
     assert [each for each in others if model_class(each).takes_scenes] == []
-    with pytest.raises(InputError, match=r"posenet knows one scene\. For data\.scenes choose denseloc or"):
+    with pytest.raises(InputError, match=r"posenet learns one scene\. For data\.scenes choose denseloc or"):
         create_model("posenet", backbone="test_efficientnet", scenes=SCENES)
-    with pytest.raises(InputError, match=r"knows one scene\. For data\.scenes choose dense"):
+    with pytest.raises(InputError, match=r"learns one scene\. For data\.scenes choose dense"):
         build("denseloc", SCENES, head="token")
 
 

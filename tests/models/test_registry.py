@@ -187,14 +187,14 @@ def test_a_truncated_checkpoint_is_refused(tmp_path, read, write, kept):
     path = tmp_path / "last.ckpt"
     write({"mambaloc": {"model": "mambaloc"}, "state_dict": {"a": torch.arange(1000)}}, path)
     path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
-    refused(read, path, "not a readable checkpoint|refused")
+    refused(read, path, "cannot be read as a checkpoint|refused")
 
 
 @READERS
 @pytest.mark.parametrize("content", [b"hello, I am a text file\n", b"lr: 0.1\n", b"\x89PNG\r\n\x1a\n", b"\x80\x02}"])
 def test_other_files_are_refused(tmp_path, read, content):
     (tmp_path / "other.ckpt").write_bytes(content)
-    refused(read, tmp_path / "other.ckpt", "not a readable checkpoint|refused")
+    refused(read, tmp_path / "other.ckpt", "cannot be read as a checkpoint|refused")
 
 
 @READERS

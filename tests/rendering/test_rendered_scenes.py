@@ -14,16 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.errors import InputError
 from mambaloc.rendering import (
-    Shot,
+    Frame,
     default_intrinsics,
-    embedded_shots,
+    embedded_frames,
     ensure_embedded_scene,
+    frames_of_sequences,
     furnished_room,
     parse_size,
     read_pose_table,
     render,
     room_around,
-    shots_of_sequences,
     smooth_trajectory,
     thinned,
     write_7scenes,
@@ -49,7 +49,7 @@ def room():
 @pytest.fixture
 def shots():
     poses = {k: smooth_trajectory(3, k, INSIDE_M) for k in (1, 2, 11)}
-    return shots_of_sequences(poses, test=[11])
+    return frames_of_sequences(poses, test=[11])
 
 
 def test_7scenes_scene_reads_back(tmp_path, room, shots):
@@ -82,7 +82,7 @@ def test_same_seed_writes_the_same_bytes(tmp_path, room, shots):
 
 def test_cambridge_labels_are_world_to_camera(tmp_path, room):
     poses = {1: smooth_trajectory(4, 1, INSIDE_M), 2: smooth_trajectory(2, 2, INSIDE_M)}
-    shots = shots_of_sequences(poses, test=[2], image="seq{sequence}/frame{frame:05d}.png")
+    shots = frames_of_sequences(poses, test=[2], image="seq{sequence}/frame{frame:05d}.png")
     folder = write_cambridge(tmp_path, "Yard", shots, room=room, size=SIZE)
     for split, number in (("train", 1), ("test", 2)):
         lines = (folder / f"dataset_{split}.txt").read_text().splitlines()
@@ -116,7 +116,7 @@ def test_failed_write_leaves_nothing(tmp_path, room, shots, monkeypatch):
 
 def test_scene_is_never_overwritten(tmp_path, room, shots):
     (tmp_path / "den").mkdir()
-    with pytest.raises(InputError, match="den: a scene is never overwritten"):
+    with pytest.raises(InputError, match="den: already exists"):
         write_7scenes(tmp_path, "den", shots, room=room, size=SIZE)
     assert list((tmp_path / "den").iterdir()) == []
 
@@ -140,7 +140,7 @@ def test_shots_must_fit_the_7scenes_layout(tmp_path, room, shots):
 
 
 def test_embedded_test_frames_are_near_training_frames_but_not_among_them():
-    shots = embedded_shots()
+    shots = embedded_frames()
     train, test = (np.stack([s.world_from_cam for s in shots if s.split == split]) for split in ("train", "test"))
     assert (len(train), len(test)) == (480, 120)
     gap_m = np.linalg.norm(test[:, None, :3, 3] - train[None, :, :3, 3], axis=-1)
@@ -156,8 +156,8 @@ def test_embedded_test_frames_are_near_training_frames_but_not_among_them():
 @pytest.fixture
 def quick_embedded(monkeypatch):
     """The embedded scene with three frames to a split and coarse textures."""
-    few = thinned(embedded_shots(), 3)
-    monkeypatch.setattr(embedded, "embedded_shots", lambda: few)
+    few = thinned(embedded_frames(), 3)
+    monkeypatch.setattr(embedded, "embedded_frames", lambda: few)
     monkeypatch.setattr(embedded, "furnished_room", lambda inside_m, seed: furnished_room(inside_m, seed, px_per_m=30))
 
 
@@ -180,7 +180,7 @@ def test_embedded_scene_of_another_version_is_left_alone(tmp_path):
     assert ensure_embedded_scene(tmp_path) == fresh
     assert (stale / "scene.json").read_text() == "{}"
     (fresh / "scene.json").unlink()
-    with pytest.raises(InputError, match="not what this version renders"):
+    with pytest.raises(InputError, match="rendered by another version"):
         ensure_embedded_scene(tmp_path)
 
 
@@ -213,7 +213,7 @@ def table(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("scene,split,image\n", "line 1: lacks the columns x,y,z"),
+        ("scene,split,image\n", "line 1: columns x, y, z are missing"),
         (HEADER, "has no row of scene 'den'"),
         (HEADER + ROW + ROW.replace(",1,2", ",one,2"), "line 3: x,y,z,qw,qx,qy,qz must be seven numbers"),
         (HEADER + "den,train,den/seq-01/frame-000000.color.png,1,2\n", "line 2: x,y,z,qw,qx,qy,qz must be"),
@@ -249,7 +249,7 @@ def test_table_quaternions_follow_the_dataset(tmp_path):
 
 
 def test_thinning_keeps_both_splits_and_their_ends():
-    shots = [Shot(str(k), split, np.eye(4)) for split in ("test", "train") for k in range(10)]
+    shots = [Frame(str(k), split, np.eye(4)) for split in ("test", "train") for k in range(10)]
     assert [(s.split, s.image) for s in thinned(shots, 3)] == [
         *[("test", k) for k in ("0", "4", "9")],
         *[("train", k) for k in ("0", "4", "9")],
@@ -292,7 +292,7 @@ def test_wrong_label_is_kept_and_does_not_blow_up_the_room(tmp_path):
     poses[30, :3, 3] = 3e9
     room = room_around(poses, seed=0, px_per_m=25)
     assert np.ptp(room.inside_m, axis=0).max() < 4
-    shots = shots_of_sequences({1: poses[28:32]}, test=[])
+    shots = frames_of_sequences({1: poses[28:32]}, test=[])
     folder = write_7scenes(tmp_path, "den", shots, room=room, size=SIZE)
     assert np.loadtxt(folder / "seq-01" / "frame-000002.pose.txt")[0, 3] == 3e9
     assert cv2.imread(str(folder / shots[2].image)).std() > 12

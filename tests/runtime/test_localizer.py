@@ -20,7 +20,7 @@ from mambaloc.images import as_rgb, read_image
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Contract, Localizer, PoseFilter, Preprocessing, frames_of, smooth
 from mambaloc.runtime.sources import PICTURES_HZ
-from mambaloc.runtime.video import follow
+from mambaloc.runtime.video import localize_video
 
 DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 48}
 
@@ -170,7 +170,7 @@ def test_what_is_no_model(model, tmp_path):
         told = replace(contract, preprocessing=replace(contract.preprocessing, **change))
         other.metadata_props[0].value = told.to_json()
         onnx.save(other, tmp_path / "other.onnx")
-        refused(tmp_path / "other.onnx", "its contract does not say")
+        refused(tmp_path / "other.onnx", "does not match its contract")
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_what_was_found_before_a_bad_picture_is_kept(model, tmp_path):
     (tmp_path / "b.png").write_bytes(b"noise")
     out = tmp_path / "poses.tum"
     with pytest.raises(InputError, match=r"b\.png: image cannot be decoded"):
-        follow(Localizer(model), str(tmp_path), out)
+        localize_video(Localizer(model), str(tmp_path), out)
     assert len(out.read_text().splitlines()) == 2  # a comment, and the first
 
 
@@ -301,7 +301,7 @@ def test_a_filters_poses_are_written(filtering, model, pictures, tmp_path):
     else:
         keep = PoseFilter()
         expected = [keep.update(*pose) for pose in zip(times_s, positions_m, quaternions, strict=True)]
-    done = follow(Localizer(model), str(pictures), tmp_path / "poses.tum", filtering)
+    done = localize_video(Localizer(model), str(pictures), tmp_path / "poses.tum", filtering)
     written = np.loadtxt(tmp_path / "poses.tum")
     assert (done.count, done.outliers) == (40, sum(pose.is_outlier for pose in expected))
     np.testing.assert_allclose(written[:, 0], times_s, atol=1e-8)  # what the filter was given
@@ -322,14 +322,14 @@ def test_ctrl_c_writes_what_was_found(filtering, model, pictures, tmp_path, monk
         return localize(image, *how)
 
     monkeypatch.setattr(localizer, "localize", interrupted)
-    assert follow(localizer, str(pictures), tmp_path / "poses.tum", filtering).count == 5
+    assert localize_video(localizer, str(pictures), tmp_path / "poses.tum", filtering).count == 5
     assert np.loadtxt(tmp_path / "poses.tum").shape == (5, 8)
 
 
 def test_where_poses_go_is_asked_before_the_work(model, tmp_path):
     for out in (tmp_path, tmp_path / "none/poses.tum"):
         with pytest.raises(InputError, match=r"--out .*: there is no folder"):
-            follow(Localizer(model), "nothing at all", out)
+            localize_video(Localizer(model), "nothing at all", out)
 
 
 def test_what_is_no_source(tmp_path):

@@ -153,7 +153,7 @@ def test_a_wrong_camera_is_not_accepted(both, frame):
 def test_a_focal_length_that_is_a_tenth_off_is_said(scale, said, map_of_den, frame):
     """A tenth moves the pose by decimetres, which nothing else shows."""
     wrong = np.array([[144.0 * scale, 0, 79.5], [0, 144 * scale, 59.5], [0, 0, 1]])
-    with pytest.warns(InputWarning, match=f"their focal length is about {said}"):
+    with pytest.warns(InputWarning, match=f"the focal length is about {said}"):
         found = Localizer(map_of_den).localize(frame, wrong)
     assert (found.source, found.covariance) == (None, None)
     assert found.focal_scale == pytest.approx(1 / scale, abs=0.05)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.errors import InputError
 from mambaloc.runtime import Noise, PoseFilter, smooth
-from mambaloc.runtime.pose_filter import _moved, _predicted
+from mambaloc.runtime.pose_filter import _boxplus, _predict
 
 NOISE = Noise(position_m=0.1, rotation_deg=4.0)
 ACCELERATION_M_S2, ACCELERATION_DEG_S2 = NOISE.acceleration_m_s2, NOISE.acceleration_deg_s2
@@ -69,8 +69,8 @@ def kalman(time_s, measured, deviation, acceleration, covariance):
     state = np.array([measured[0], 0.0])
     states, covariances = [state], [covariance]
     for step_s, value in zip(np.diff(time_s), measured[1:], strict=True):
-        motion, wander = transition(step_s, acceleration)
-        state, covariance = motion @ state, motion @ covariance @ motion.T + wander
+        motion, process_noise = transition(step_s, acceleration)
+        state, covariance = motion @ state, motion @ covariance @ motion.T + process_noise
         gain = covariance[:, 0] / (covariance[0, 0] + deviation**2)
         state = state + gain * (value - state[0])
         covariance = covariance - np.outer(gain, covariance[0])
@@ -86,9 +86,9 @@ def least_squares(time_s, measured, deviation, acceleration, covariance):
     information[:2, :2] = np.linalg.inv(covariance)
     right[:2] = information[:2, :2] @ (measured[0], 0)
     for k, step_s in enumerate(np.diff(time_s)):
-        motion, wander = transition(step_s, acceleration)
+        motion, process_noise = transition(step_s, acceleration)
         both = np.hstack([-motion, np.eye(2)])
-        information[2 * k : 2 * k + 4, 2 * k : 2 * k + 4] += both.T @ np.linalg.inv(wander) @ both
+        information[2 * k : 2 * k + 4, 2 * k : 2 * k + 4] += both.T @ np.linalg.inv(process_noise) @ both
         information[2 * k + 2, 2 * k + 2] += deviation**-2
         right[2 * k + 2] += measured[k + 1] / deviation**2
     covariances = np.linalg.inv(information).reshape(count, 2, count, 2)
@@ -121,7 +121,7 @@ def test_rotation_about_one_axis_is_linear_theorys(run, oracle):
     states, covariances = oracle(time_s, angle_rad, np.radians(4), np.radians(ACCELERATION_DEG_S2), covariance)
     expected = wxyz(Rotation.from_rotvec(states[:, :1] * axis))
     assert angle_deg(of(estimates, "quaternion"), expected).max() < 1e-5
-    np.testing.assert_allclose(of(estimates, "turn_rad_s"), states[:, 1:] * axis, atol=1e-7)
+    np.testing.assert_allclose(of(estimates, "angular_velocity_rad_s"), states[:, 1:] * axis, atol=1e-7)
     variance = np.einsum("i,nij,j->n", axis, of(estimates, "covariance")[:, ROTATION, ROTATION], axis)
     np.testing.assert_allclose(variance, covariances[:, 0, 0], rtol=1e-5)
 
@@ -133,25 +133,27 @@ def test_a_constant_turn_is_recovered():
     off = Rotation.from_rotvec(np.radians(2) * np.random.default_rng(5).normal(size=(200, 3)))
     calm = Noise(rotation_deg=2.0, acceleration_deg_s2=1.0)
     estimates = update_each(time_s, np.zeros((200, 3)), wxyz(true * off), calm)
-    np.testing.assert_allclose(estimates[-1].turn_rad_s, turn_rad_s, atol=0.03)
+    np.testing.assert_allclose(estimates[-1].angular_velocity_rad_s, turn_rad_s, atol=0.03)
     assert angle_deg(estimates[-1].quaternion, wxyz(true[-1])) < 1.0
     exact = update_each(time_s, np.zeros((200, 3)), wxyz(true), calm)
-    np.testing.assert_allclose(exact[-1].turn_rad_s, turn_rad_s, atol=1e-4)
+    np.testing.assert_allclose(exact[-1].angular_velocity_rad_s, turn_rad_s, atol=1e-4)
 
 
 def test_errors_move_as_the_state_does():
     """The matrix that moves errors on is the derivative of the motion, but for the curvature of a turn."""
     estimate = PoseFilter(NOISE).update(0, [1, 2, 3], wxyz(Rotation.random(random_state=1)))
-    estimate = replace(estimate, velocity_m_s=np.array([1.0, 2, 3]), turn_rad_s=np.array([1.0, -2, 2]))
+    estimate = replace(estimate, velocity_m_s=np.array([1.0, 2, 3]), angular_velocity_rad_s=np.array([1.0, -2, 2]))
     step_s, tiny = 0.1, 1e-6
-    predicted, motion, _ = _predicted(estimate, step_s, NOISE)
+    predicted, motion, _ = _predict(estimate, step_s, NOISE)
     after = Rotation.from_quat(predicted.quaternion, scalar_first=True)
     for column, error in enumerate(tiny * np.eye(12)):
-        moved, *_ = _predicted(_moved(estimate, error, estimate.covariance), step_s, NOISE)
+        moved, *_ = _predict(_boxplus(estimate, error, estimate.covariance), step_s, NOISE)
         turned = (after.inv() * Rotation.from_quat(moved.quaternion, scalar_first=True)).as_rotvec()
         off = [moved.position_m - predicted.position_m, moved.velocity_m_s - predicted.velocity_m_s]
-        derivative = np.concatenate([*off, turned, moved.turn_rad_s - predicted.turn_rad_s]) / tiny
-        curved = step_s * np.linalg.norm(estimate.turn_rad_s) * step_s / 2 if column >= 9 else 0
+        derivative = (
+            np.concatenate([*off, turned, moved.angular_velocity_rad_s - predicted.angular_velocity_rad_s]) / tiny
+        )
+        curved = step_s * np.linalg.norm(estimate.angular_velocity_rad_s) * step_s / 2 if column >= 9 else 0
         np.testing.assert_allclose(motion[:, column], derivative, atol=1e-6 + curved)
 
 

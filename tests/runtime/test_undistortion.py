@@ -222,7 +222,7 @@ def test_a_network_is_given_the_undistorted_picture_and_its_camera():
         ),
         (PINHOLE, (320, 180), None, "den.onnx: an image of 320x180 has another shape than 320x240"),
         (PINHOLE, (240, 320), None, "den.onnx: an image of 240x320 has another shape than 320x240"),
-        (PINHOLE, STORED, np.eye(3), "intrinsics: of distorted images, the lens says them"),
+        (PINHOLE, STORED, np.eye(3), "intrinsics: distorted images have those of their lens"),
     ],
 )
 def test_wrong_uses_are_told_in_one_line(undistortion, size, intrinsics, says):

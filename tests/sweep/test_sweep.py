@@ -120,12 +120,12 @@ def test_a_trial_comes_after_the_one_whose_run_it_needs(folder):
 @pytest.mark.parametrize(
     ("told", "message"),
     [
-        ({}, "names no axes"),
-        ({"axes": {}}, "names no axes"),
+        ({}, "has no 'axes'"),
+        ({"axes": {}}, "has no 'axes'"),
         ({"axes": {"a": {}}}, "axis a has no labels"),
         ({"axes": {"a": {"x": "r.yaml"}}}, "give a list of recipes"),
         ({"axes": {"a": {"x": ["none.yaml"]}}}, "none.yaml cannot be read"),
-        ({"axes": {"a": {"x": ["r.yaml"]}}, "seeds": 3}, "has seeds; a sweep has axes"),
+        ({"axes": {"a": {"x": ["r.yaml"]}}, "seeds": 3}, "unknown key seeds; choose among axes"),
         ({"axes": {"a": {"x": ["r.yaml"]}}, "always": []}, "'always' is now called 'common_args'. Rename"),
         ({"axes": {"a": {"x": ["r.yaml"]}}, "without": []}, "'without' is now called 'exclude'. Rename"),
         ({"axes": {"a": {"x": ["r.yaml"]}}, "cpus": 0}, "cpus is 0"),
@@ -250,7 +250,7 @@ def test_a_store_of_an_earlier_version_is_read(folder):
 def test_two_processes_do_not_run_into_one_folder(folder):
     sweep = six(folder)
     (folder / "out").mkdir()
-    with running._alone(folder / "out"), pytest.raises(InputError, match="another process runs trials into it"):
+    with running._alone(folder / "out"), pytest.raises(InputError, match="another process is writing trials there"):
         run_sweep(sweep, folder / "out")
 
 

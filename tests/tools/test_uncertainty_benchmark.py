@@ -12,9 +12,9 @@ from uncertainty_methods import (
     LEVELS,
     change_by_rejection,
     measure_certainty,
+    ood_auroc,
     pose_spread,
     rank_correlation,
-    told_apart,
 )
 from uncertainty_report import print_certainty, write_certainty
 
@@ -32,7 +32,7 @@ def test_figures_against_scipy():
     tensors = [torch.from_numpy(each) for each in (score, error, elsewhere)]
     assert rank_correlation(*tensors[:2]) == pytest.approx(spearmanr(score, error).statistic, abs=1e-6)
     expected = mannwhitneyu(elsewhere, score).statistic / (60 * 40)
-    assert told_apart(tensors[0], tensors[2]) == pytest.approx(expected, abs=1e-6)
+    assert ood_auroc(tensors[0], tensors[2]) == pytest.approx(expected, abs=1e-6)
 
 
 def test_rejection_by_hand():

@@ -10,7 +10,7 @@ import cv2
 import pytest
 import torch
 
-from mambaloc.callbacks import PoseProgressBar, TrajectoryPlot, WallClock, WholeCheckpoints, progress, wall_clock
+from mambaloc.callbacks import AtomicCheckpointIO, PoseProgressBar, TrajectoryPlot, WallClock, progress, wall_clock
 from mambaloc.cli import main
 from mambaloc.errors import InputError
 
@@ -120,14 +120,14 @@ def test_trajectory_plot_is_drawn_when_due(trained, tmp_path):
 
 def test_a_checkpoint_passes_through_no_other_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
-    WholeCheckpoints().save_checkpoint({"epoch": 1}, tmp_path / "run/last.ckpt")
+    AtomicCheckpointIO().save_checkpoint({"epoch": 1}, tmp_path / "run/last.ckpt")
     assert torch.load(tmp_path / "run/last.ckpt", weights_only=True) == {"epoch": 1}
 
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EACCES])  # Lightning keeps the latter to itself
 def test_a_checkpoint_that_cannot_be_written_leaves_the_last(error, tmp_path, monkeypatch):
     path = tmp_path / "last.ckpt"
-    WholeCheckpoints().save_checkpoint({"epoch": 1}, path)
+    AtomicCheckpointIO().save_checkpoint({"epoch": 1}, path)
 
     def half(partial: Path, content: bytes) -> None:
         partial.write_text("half of it")
@@ -135,6 +135,6 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last(error, tmp_path, mo
 
     monkeypatch.setattr(Path, "write_bytes", half)
     with pytest.raises(OSError, match="no"):
-        WholeCheckpoints().save_checkpoint({"epoch": 2}, path)
+        AtomicCheckpointIO().save_checkpoint({"epoch": 2}, path)
     assert torch.load(path, weights_only=True) == {"epoch": 1}
     assert list(tmp_path.iterdir()) == [path]

@@ -150,7 +150,7 @@ def test_kept_answers_are_those_of_the_center_crops(teacher, scenes, tmp_path, m
 def test_kept_answers_and_views_exclude_each_other(teacher):
     system = student_of(teacher, cache_teacher=True)
     system.trainer = SimpleNamespace(datamodule=SimpleNamespace(hparams={"views": 4}))
-    with pytest.raises(InputError, match=r"model.cache_teacher: asks of frames alone, not of data.views"):
+    with pytest.raises(InputError, match=r"model.cache_teacher: works with real frames alone"):
         system.on_fit_start()
 
 
@@ -232,8 +232,8 @@ def test_a_plain_students_checkpoint_resumes_no_distillation(teacher, scenes, tm
         ({"teacher": None}, r"model\.teacher: distillation needs one"),
         ({"teacher": "nothing.ckpt"}, "nothing.ckpt: no such checkpoint"),
         ({"image_size": 48}, "32x32 and 48x48 pixels; set data.image_size"),
-        ({"hard_weight": 0, "soft_weight": 0}, "give one of them"),
-        ({"feature_weight": -1}, "none is negative"),
+        ({"hard_weight": 0, "soft_weight": 0}, "one of the first two must be positive"),
+        ({"feature_weight": -1}, "none may be negative"),
         ({"compile_mode": "default"}, r"model\.compile_mode: steps with a teacher"),
         ({"soft_args": {"temprature": 3}}, "soft_args"),
         ({"soft": "mse"}, "'kl' or 'l2'"),

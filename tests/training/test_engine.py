@@ -216,7 +216,7 @@ def test_a_schedule_made_for_another_length_is_not_gone_on_with(tiny_recipe, tmp
 
 
 def test_summed_gradients_are_no_graphs(scenes):
-    with pytest.raises(InputError, match="a replayed graph overwrites gradients"):
+    with pytest.raises(InputError, match="a replayed graph overwrites accumulated gradients"):
         fit(scenes, {"compile_mode": "reduce-overhead"}, accumulate_grad_batches=2)
 
 

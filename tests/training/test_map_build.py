@@ -152,7 +152,7 @@ def test_unknown_cameras_are_a_warning(capture, tmp_path):
 def test_frames_that_give_no_map_are_a_warning_and_an_older_map_goes(den, tmp_path):
     (tmp_path / "map").mkdir()
     (tmp_path / "map/map.safetensors").write_bytes(b"of other frames")
-    with pytest.warns(InputWarning, match="needs two frames or more, and it has 1"):
+    with pytest.warns(InputWarning, match="needs two frames or more, but it has 1"):
         MapBuild(True, **SETTINGS).on_fit_start(run_of(data_of(den, keep_count=1), tmp_path), None)
     assert not (tmp_path / "map/map.safetensors").exists()
 

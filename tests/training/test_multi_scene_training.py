@@ -36,14 +36,14 @@ OFFSET_M = (500_000.0, 4_000_000.0, 30.0)
 def two_scenes(made_once, scenes):
     """A root with ``heads``, and ``lab``: another room, whose frame lies far from its world's origin."""
     from mambaloc.rendering.scenes.layouts import write_7scenes
-    from mambaloc.rendering.scenes.shots import shots_of_sequences
+    from mambaloc.rendering.scenes.shots import frames_of_sequences
     from mambaloc.rendering.trajectories import smooth_trajectory
 
     def render(root: Path) -> None:
         shutil.copytree(scenes / "heads", root / "heads")
         inside_m = ((-2.0, -2.0, 1.2), (2.0, 2.0, 1.6))
         sequences = {n: smooth_trajectory(6 if n == 3 else 12, seed=n + 10, inside_m=inside_m) for n in (1, 2, 3)}
-        lab = write_7scenes(root, "lab", shots_of_sequences(sequences, {3}), size=(96, 72), seed=5)
+        lab = write_7scenes(root, "lab", frames_of_sequences(sequences, {3}), size=(96, 72), seed=5)
         note = json.loads((lab / "scene.json").read_text())
         (lab / "scene.json").write_text(json.dumps({**note, "world": {"offset_m": OFFSET_M, "metres_per_unit": 1.0}}))
 

@@ -17,7 +17,7 @@ from mambaloc.distillation import LitDistillation
 from mambaloc.models import LitPoseRegressor, create_model, list_models
 from mambaloc.models.registry import model_class
 from mambaloc.rendering.scenes.layouts import write_cambridge
-from mambaloc.rendering.scenes.shots import FRAME_CAMBRIDGE, shots_of_sequences
+from mambaloc.rendering.scenes.shots import FRAME_CAMBRIDGE, frames_of_sequences
 from mambaloc.rendering.trajectories import smooth_trajectory
 
 REPOSITORY = Path(__file__).parents[2]
@@ -38,7 +38,7 @@ def cambridge(made_once):
     def render(root: Path) -> None:
         inside_m = ((-4.0, -4.0, 1.5), (4.0, 4.0, 2.5))
         sequences = {n: smooth_trajectory(6, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
-        shots = shots_of_sequences(sequences, {3}, FRAME_CAMBRIDGE)
+        shots = frames_of_sequences(sequences, {3}, FRAME_CAMBRIDGE)
         write_cambridge(root, "KingsCollege", shots, size=(96, 54), points=True)
 
     return made_once("cambridge", render)

@@ -13,7 +13,7 @@ import timm
 import torch
 from safetensors.torch import save_file
 
-from mambaloc.rendering import default_intrinsics, embedded_room, embedded_shots, render
+from mambaloc.rendering import default_intrinsics, embedded_frames, embedded_room, render
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -56,11 +56,11 @@ def test_a_picture_alone_is_localized_in_the_embedded_room(tmp_path, capsys):
     tool("localize", embedded_shot(tmp_path), "--out", tmp_path / "poses.tum")
     assert "1 poses (1 from the map, 0 from the network) in embedded/room" in capsys.readouterr().out
     (row,) = np.loadtxt(tmp_path / "poses.tum", ndmin=2)
-    assert np.linalg.norm(row[1:4] - embedded_shots()[0].world_from_cam[:3, 3]) < 0.05
+    assert np.linalg.norm(row[1:4] - embedded_frames()[0].world_from_cam[:3, 3]) < 0.05
 
 
 def embedded_shot(folder):
-    rgb, _ = render(embedded_room(), default_intrinsics((320, 240)), embedded_shots()[0].world_from_cam, (320, 240))
+    rgb, _ = render(embedded_room(), default_intrinsics((320, 240)), embedded_frames()[0].world_from_cam, (320, 240))
     cv2.imwrite(str(folder / "shot.png"), rgb[..., ::-1])
     return folder / "shot.png"
 
@@ -97,7 +97,7 @@ def test_a_checkpoint_is_published(trained_student, tmp_path, capsys):
         ),
         ("export", ["student.embedded_rom"], "Did you mean student.embedded_room?"),
         ("export", ["{run}/checkpoints/last.ckpt", "--out", "{run}"], "already exists"),
-        ("evaluate", ["{run}/checkpoints/last.ckpt", "--retrieval"], "started from scratch"),
+        ("evaluate", ["{run}/checkpoints/last.ckpt", "--retrieval"], "needs a backbone that started from pretrained"),
         ("verify_bundle", ["nothing"], "give a bundle's folder"),
         ("verify_bundle", ["{run}"], "give a bundle's folder"),
         ("localize", ["nothing.onnx", "0"], "nothing.onnx: no such model"),

@@ -53,10 +53,10 @@ def test_every_kind_is_drawn(kind, checkpoints, tmp_path, capsys):
     [
         (["portrait", "CHECKPOINT"], "portrait"),
         (["heatmaps", "nothing.ckpt"], "nothing.ckpt: no such checkpoint"),
-        (["heatmaps", "CHECKPOINT", "--frames", "0"], "--frames 0: give 1 to"),
+        (["heatmaps", "CHECKPOINT", "--frames", "0"], "--frames 0: must be 1 to"),
         (["features", "CHECKPOINT", "--frames", "9"], "there are 8 test frames"),
         (["heatmaps", "CHECKPOINT", "OTHER"], "draw systems of one image size together"),
-        (["heatmaps", "CHECKPOINT", "ELSEWHERE"], "sees other test frames"),
+        (["heatmaps", "CHECKPOINT", "ELSEWHERE"], "has other test frames"),
         (["time", "STUDENT"], "was not validated"),
         (["cumulative", "CHECKPOINT", "--out", "FILE"], "cannot be written"),
     ],

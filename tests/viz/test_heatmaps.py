@@ -89,7 +89,7 @@ def test_transposenets_branches_read_different_maps():
 def test_a_backbone_without_a_map_is_refused():
     network = small("student", "none").network
     network.backbone = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIDE * SIDE, 8))
-    with pytest.raises(InputError, match="pools no map"):
+    with pytest.raises(InputError, match="has no spatial feature map"):
         heat_maps(network, torch.rand(1, 3, SIDE, SIDE))
 
 

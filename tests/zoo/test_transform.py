@@ -33,7 +33,7 @@ def test_arrays_and_files_are_alike(tmp_path):
 
 
 def test_an_untrained_system_has_no_transform():
-    with pytest.raises(InputError, match="student: does not say what images it was trained on"):
+    with pytest.raises(InputError, match="student: has no record of its training images"):
         mambaloc.create_transform(mambaloc.create_model("student", backbone_weights=None))
 
 

@@ -142,14 +142,14 @@ def test_changed_weights_are_refused(copy):
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(content)
-    refused(copy, "sha256 differs")
+    refused(copy, "has another sha256")
     weights.unlink()
     refused(copy, "cannot be read")
 
 
 def test_a_changed_map_is_refused_and_the_model_loads(copy):
     (copy / "map.safetensors").write_bytes((copy / "map.safetensors").read_bytes()[:-1])
-    with pytest.raises(InputError, match=r"map\.safetensors: .*sha256 differs"):
+    with pytest.raises(InputError, match=r"map\.safetensors: has another sha256"):
         map_of(f"local-dir:{copy}")
     assert type(load(f"local-dir:{copy}")) is LitMambaLoc
     (copy / "map.safetensors").unlink()
@@ -181,13 +181,13 @@ def test_a_pickle_in_place_of_weights_is_not_opened(copy):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m["results"][0].pop("commit"), "result 1 lacks commit; nothing is told without"),
-        (lambda m: m["results"][0].update(seconds=None), "result 1 lacks seconds"),
+        (lambda m: m["results"][0].pop("commit"), "result 1: missing field commit. Every result states its provenance"),
+        (lambda m: m["results"][0].update(seconds=None), "result 1: missing field seconds"),
         (lambda m: m["results"][0].update(n="many"), "n is 'many'"),
-        (lambda m: m.update(results=["0.1 m"]), "result 1 is not a mapping"),
-        (lambda m: m.pop("licence"), "lacks licence"),
-        (lambda m: m.update(extra=1), "has extra"),
-        (lambda m: m.update(manifest=2), "no manifest of version 1"),
+        (lambda m: m.update(results=["0.1 m"]), "result 1: expected a mapping"),
+        (lambda m: m.pop("licence"), "missing field licence"),
+        (lambda m: m.update(extra=1), "unknown field extra"),
+        (lambda m: m.update(manifest=2), "expected a manifest of version 1"),
         (lambda m: m.update(model="mambalock"), "mambalock"),
         (lambda m: m["arguments"].update(dim=32), "does not fit"),
         (lambda m: m["arguments"].update(dime=32), "does not fit"),
@@ -207,7 +207,7 @@ def test_what_is_no_manifest(content, copy):
 
 
 def test_a_name_is_not_taken_twice_nor_made_up(run, released):
-    with pytest.raises(InputError, match="is released already"):
+    with pytest.raises(InputError, match="already exists"):
         publish(run / "checkpoints/best.ckpt", "tiny", released.parent, "cpu")
     with pytest.raises(InputError, match="choose another"):
         publish(run / "checkpoints/best.ckpt", "../tiny", released.parent, "cpu")

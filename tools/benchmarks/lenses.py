@@ -17,8 +17,8 @@ from mambaloc.console import OptionParser, exits_cleanly, whole_number
 from mambaloc.errors import InputError
 from mambaloc.images import Image
 from mambaloc.rendering import default_intrinsics, embedded_room, render, sensor
-from mambaloc.rendering.scenes.embedded import embedded_shots
-from mambaloc.rendering.scenes.shots import Shot
+from mambaloc.rendering.scenes.embedded import embedded_frames
+from mambaloc.rendering.scenes.shots import Frame
 from mambaloc.runtime import Localizer
 from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_deg
 
@@ -42,7 +42,7 @@ def main() -> None:
     localizer = Localizer(args.model, 1, sparse_map=False)
     if localizer.contract is None or localizer.contract.intrinsics is None:
         raise InputError(f"{args.model}: takes no intrinsics. Give a model that does, such as DenseLoc's.")
-    shots = [shot for shot in embedded_shots() if shot.split == "test"][:: args.every]
+    shots = [shot for shot in embedded_frames() if shot.split == "test"][:: args.every]
     print(provenance.machine())
     print(
         f"{len(shots)} views each; camera stated: median, mean, median over that of training; camera unstated: median"
@@ -63,7 +63,7 @@ def in_words(error: NDArray[np.float64]) -> str:
 
 
 def lens_errors(
-    localizer: Localizer, shots: Sequence[Shot], name: str
+    localizer: Localizer, shots: Sequence[Frame], name: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Errors (N, 2) in metres and degrees with the camera stated, and without; None where it must be."""
     zoom, size = LENSES[name]
@@ -80,7 +80,7 @@ def lens_errors(
     return np.array(stated), np.array(unstated) if unstated else None
 
 
-def error(localizer: Localizer, rgb: Image, intrinsics: ArrayLike | None, shot: Shot) -> tuple[float, float]:
+def error(localizer: Localizer, rgb: Image, intrinsics: ArrayLike | None, shot: Frame) -> tuple[float, float]:
     """Of one view, in metres and degrees."""
     found = localizer.localize(rgb, intrinsics)
     off_m = float(np.linalg.norm(found.position_m - shot.world_from_cam[:3, 3]))

@@ -49,7 +49,7 @@ Pictures = Callable[[], Iterator[Frames]]
 
 
 @dataclass(frozen=True)
-class Way:
+class UncertaintyMethod:
     """An estimate of a pose's uncertainty: larger scores for what should be wrong by more.
 
     Shape:
@@ -68,7 +68,7 @@ class Way:
 
 
 @dataclass(frozen=True)
-class Certainty:
+class UncertaintyReport:
     """What was found of one system.
 
     Args:
@@ -93,12 +93,12 @@ class Certainty:
     radii: _ByLevel
     unfamiliarity: Tensor
     unfamiliarity_elsewhere: Tensor
-    ways: list[Way]
+    ways: list[UncertaintyMethod]
 
 
 def measure_certainty(
     systems: Mapping[str, tuple[LitPoseRegressor, PoseDataModule]], elsewhere: Path | None = None
-) -> list[Certainty]:
+) -> list[UncertaintyReport]:
     """Compare estimates of a pose's uncertainty on the test frames of trained systems.
 
     Args:
@@ -121,7 +121,7 @@ def measure_certainty(
             far = _distances(network, head, data.crop, there)
             by_spread = _by_spread(network, networks, data.crop, _test_frames(data), there)
         found.append(
-            Certainty(
+            UncertaintyReport(
                 name,
                 f"{system.registry_name} on {data.hparams['dataset']}/{data.hparams['scene']}, test",
                 len(held_out.distance),
@@ -131,7 +131,7 @@ def measure_certainty(
                 radii,
                 test.distance / head.familiar,
                 far / head.familiar,
-                [Way("training images", 1, test.distance, test.distance, far), *by_spread],
+                [UncertaintyMethod("training images", 1, test.distance, test.distance, far), *by_spread],
             )
         )
     return found
@@ -167,7 +167,7 @@ def median_of_surest(score: Tensor, error: Tensor, share: float) -> Tensor:
     return error[kept].double().quantile(0.5)
 
 
-def told_apart(score: Tensor, elsewhere: Tensor) -> float:
+def ood_auroc(score: Tensor, elsewhere: Tensor) -> float:
     """Area under the ROC curve: the chance that an image of another place scores higher than a test frame."""
     of_elsewhere = torch.cat((torch.zeros(len(score)), torch.ones(len(elsewhere))))
     ranks = (
@@ -178,7 +178,7 @@ def told_apart(score: Tensor, elsewhere: Tensor) -> float:
 
 def _by_spread(
     network: PoseNetwork, networks: list[PoseNetwork], size: tuple[int, int], test: Pictures, there: Pictures
-) -> list[Way]:
+) -> list[UncertaintyMethod]:
     """Ways that localize an image several times, and take how far apart the poses are."""
     told: dict[str, tuple[int, Callable[[Frames], list[PosePrediction]]]] = {
         "dropout": (PASSES, lambda frames: _dropped_out(network, frames, size)),
@@ -190,12 +190,13 @@ def _by_spread(
             lambda frames: [_localized(each, frames, size) for each in networks],
         )
     ways = [
-        Way(name, passes, *_spreads(poses, test), _spreads(poses, there)[0]) for name, (passes, poses) in told.items()
+        UncertaintyMethod(name, passes, *_spreads(poses, test), _spreads(poses, there)[0])
+        for name, (passes, poses) in told.items()
     ]
     if not network.takes_intrinsics:
         return ways
     position, rotation = _disagreement(network, size, test)
-    return [Way("cells", 1, position, rotation, _disagreement(network, size, there)[0]), *ways]
+    return [UncertaintyMethod("cells", 1, position, rotation, _disagreement(network, size, there)[0]), *ways]
 
 
 def _localized(

@@ -16,12 +16,12 @@ from torch import Tensor
 from uncertainty_methods import (
     LEVELS,
     REJECTED,
-    Certainty,
-    Way,
+    UncertaintyMethod,
+    UncertaintyReport,
     change_by_rejection,
     median_of_surest,
+    ood_auroc,
     rank_correlation,
-    told_apart,
 )
 
 from mambaloc.benchmark.report import new_table
@@ -33,7 +33,7 @@ _KEPT = np.linspace(1, 0.1, 46)
 _ERRORS = ("position", "rotation")
 
 
-def print_certainty(found: Sequence[Certainty], machine: str) -> None:
+def print_certainty(found: Sequence[UncertaintyReport], machine: str) -> None:
     """Print how the ways compare, and what the radii hold; means over the checkpoints."""
     console = Console(highlight=False)
     columns = ("passes", "rank m", "rank °", "median m", "median °", "out of place")
@@ -63,10 +63,10 @@ def print_certainty(found: Sequence[Certainty], machine: str) -> None:
     console.print(f"{found[0].where}; {counts}; means over {len(found)} checkpoint(s); {machine}", soft_wrap=True)
 
 
-def compared(found: Sequence[Certainty]) -> dict[str, dict[str, Any]]:
+def compared(found: Sequence[UncertaintyReport]) -> dict[str, dict[str, Any]]:
     """Figures of each way, means over the checkpoints: how scores rank errors, what rejecting the least sure is worth.
 
-    ``told_apart`` is None where there were no images of another place.
+    ``ood_auroc`` is None where there were no images of another place.
     """
     figures = {}
     for number, way in enumerate(found[0].ways):
@@ -79,7 +79,7 @@ def compared(found: Sequence[Certainty]) -> dict[str, dict[str, Any]]:
     return figures
 
 
-def write_certainty(found: Sequence[Certainty], folder: Path, machine: str) -> None:
+def write_certainty(found: Sequence[UncertaintyReport], folder: Path, machine: str) -> None:
     """Write ``uncertainty.json`` and ``uncertainty.png`` into a folder.
 
     Raises:
@@ -109,7 +109,7 @@ def write_certainty(found: Sequence[Certainty], folder: Path, machine: str) -> N
         _draw(found, folder / "uncertainty.png")
 
 
-def _draw(found: Sequence[Certainty], path: Path) -> None:
+def _draw(found: Sequence[UncertaintyReport], path: Path) -> None:
     """Coverage and familiarity above, sparsification below."""
     figure = Figure(figsize=(10, 8), layout="constrained")
     (coverage, familiarity), below = figure.subplots(2, 2)
@@ -126,7 +126,7 @@ def _draw(found: Sequence[Certainty], path: Path) -> None:
     write_png(figure, path)
 
 
-def _draw_coverage(axes: Axes, found: Sequence[Certainty]) -> None:
+def _draw_coverage(axes: Axes, found: Sequence[UncertaintyReport]) -> None:
     axes.plot([0.4, 1], [0.4, 1], color="#9ca3af", linewidth=0.8, linestyle=":")
     shares = np.array([[each.coverage[level] for level in LEVELS] for each in found])
     for color, column, of in zip(COLORS[1:], (0, 1), _ERRORS, strict=False):
@@ -137,7 +137,7 @@ def _draw_coverage(axes: Axes, found: Sequence[Certainty]) -> None:
     axes.legend(frameon=False, loc="upper left")
 
 
-def _draw_familiarity(axes: Axes, found: Sequence[Certainty]) -> None:
+def _draw_familiarity(axes: Axes, found: Sequence[UncertaintyReport]) -> None:
     here = np.concatenate([each.unfamiliarity.numpy() for each in found])
     there = np.concatenate([each.unfamiliarity_elsewhere.numpy() for each in found])
     bins = np.linspace(0, 1.05 * max([1.0, here.max(), *there]), 40)
@@ -151,10 +151,10 @@ def _draw_familiarity(axes: Axes, found: Sequence[Certainty]) -> None:
     axes.legend(frameon=False, loc="upper left")
 
 
-def _draw_sparsification(axes: Axes, found: Sequence[Certainty], of: str) -> None:
+def _draw_sparsification(axes: Axes, found: Sequence[UncertaintyReport], of: str) -> None:
     """Median error of those kept, over that of all, as the least sure are left out; dotted, if the worst were."""
 
-    def curve(score_of: Callable[[Certainty], Tensor]) -> np.ndarray:
+    def curve(score_of: Callable[[UncertaintyReport], Tensor]) -> np.ndarray:
         curves = []
         for each in found:
             error = _error(each, of)
@@ -175,16 +175,16 @@ def _draw_sparsification(axes: Axes, found: Sequence[Certainty], of: str) -> Non
     axes.set_ylim(bottom=0)
 
 
-def _figures(each: Certainty, way: Way) -> dict[str, float | None]:
+def _figures(each: UncertaintyReport, way: UncertaintyMethod) -> dict[str, float | None]:
     figures: dict[str, float | None] = {}
     for of in _ERRORS:
         score, error = getattr(way, of), _error(each, of)
         figures[f"{of}_rank_correlation"] = rank_correlation(score, error)
         figures[f"{of}_change"] = change_by_rejection(score, error)
-    return {**figures, "told_apart": told_apart(way.position, way.elsewhere) if len(way.elsewhere) else None}
+    return {**figures, "told_apart": ood_auroc(way.position, way.elsewhere) if len(way.elsewhere) else None}
 
 
-def _error(each: Certainty, of: str) -> Tensor:
+def _error(each: UncertaintyReport, of: str) -> Tensor:
     return each.position_error_m if of == "position" else each.rotation_error_deg
 
 

@@ -27,7 +27,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ImportStatus:
     """``usable``, ``usable, but ...`` or ``not usable: ...``."""
 
     is_usable: bool
@@ -43,8 +43,8 @@ class Verdict:
         return f"{lead} {'; '.join(reasons)}".strip()
 
 
-def verdict_of(findings: Sequence[Finding]) -> Verdict:
+def verdict_of(findings: Sequence[Finding]) -> ImportStatus:
     """Sum up: what is fatal alone, where anything is."""
     fatal = tuple(finding.concern for finding in findings if finding.is_fatal)
     concerns = tuple(finding.concern for finding in findings if finding.concern)
-    return Verdict(not fatal, fatal or concerns)
+    return ImportStatus(not fatal, fatal or concerns)

@@ -123,8 +123,10 @@ def _table(source: Path) -> Path:
     if source.is_file():
         return source
     tables = sorted(source.glob("*.csv")) or sorted(source.resolve().parent.glob("*.csv"))
-    if len(tables) != 1:
-        names = ", ".join(table.name for table in tables[:8]) or "none"
+    if not tables:
+        raise InputError(f"{source}: contains no CSV file. Give a folder that does.")
+    if len(tables) > 1:
+        names = ", ".join(table.name for table in tables[:8])
         raise InputError(f"{source}: has several CSV files: {names}. Give one file.")
     return tables[0]
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.motion import Motion, apart, quaternions
 from mambaloc.importing.splits.selection import (
+    COVERAGE_DEG,
     MOST_NEAR,
     NEAR_STEPS,
-    REACH_DEG,
     Kind,
-    Proposal,
+    SplitCandidate,
     best_of,
     distances,
     measured,
@@ -38,7 +38,7 @@ _LEAST_STEPS = 1e-3  # where frames coincide
 Rows = NDArray[np.int64]
 
 
-def propose(capture: Capture, motion: Motion) -> list[Proposal]:
+def propose(capture: Capture, motion: Motion) -> list[SplitCandidate]:
     """One split of each kind that there can be, in the order of :data:`~mambaloc.importing.splits.selection.KINDS`.
 
     Each holds out a block of training frames for validation, too, unless the capture's own files have one.
@@ -61,19 +61,19 @@ class _Advisor:
         self.sequences = [self._laid_out(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
         self.gap = max(_LEAST_GAP, round(_GAP_SHARE * max(map(len, self.sequences))))
 
-    def given(self) -> Proposal | None:
+    def given(self) -> SplitCandidate | None:
         split = np.array(self.capture.split if self.capture.split is not None else (), dtype="<U6")
         if not _is_whole(split):
             return None
         return self.with_validation(self._measured("given", "as the capture's own files have it", split))
 
-    def by_sequence(self) -> Proposal | None:
+    def by_sequence(self) -> SplitCandidate | None:
         """Whole recordings: of what makes a good split, the one nearest to a fifth of all frames."""
         groups = [[sequence] for sequence in self.sequences]
         if len(self.sequences) >= _MANY_SEQUENCES:
             groups += [self.sequences[first::_MANY_SEQUENCES] for first in range(_MANY_SEQUENCES)]
         total = len(self.capture.images)
-        found: list[Proposal] = []
+        found: list[SplitCandidate] = []
         for group in groups if len(self.sequences) > 1 else []:
             rows = np.concatenate(group)
             if _LEAST_BLOCK <= len(rows) <= total / 2:
@@ -86,7 +86,7 @@ class _Advisor:
             min(found, key=lambda each: (not each.is_good, abs(each.counts["test"] / total - TEST_SHARE)))
         )
 
-    def by_loop(self) -> Proposal | None:
+    def by_loop(self) -> SplitCandidate | None:
         """A stretch of the longest sequence that the camera passed at another time, too."""
         rows = max(self.sequences, key=len)
         block = self._seen_again(rows) if self.motion.in_order else None
@@ -100,7 +100,7 @@ class _Advisor:
         every = -(-len(rows) // _LOOP_FRAMES)
         thin = rows[::every]
         length, turn_deg = apart(self.position, self.quaternion, thin, thin)
-        is_seen = (length <= _LOOP_REACH * self.motion.extent) & (turn_deg <= REACH_DEG)
+        is_seen = (length <= _LOOP_REACH * self.motion.extent) & (turn_deg <= COVERAGE_DEG)
         steps = self.motion.steps(length, turn_deg)
         time = np.arange(len(thin))
         window = max(self.gap, round(_PASS_SHARE * len(thin)))
@@ -118,10 +118,10 @@ class _Advisor:
                 return rows[start * every : (start + size) * every]
         return None
 
-    def by_blocks(self) -> Proposal | None:
+    def by_blocks(self) -> SplitCandidate | None:
         """Evenly spread blocks of a fifth of all frames, as few as make a good split; what is near them is left out."""
         total = len(self.capture.images)
-        found: list[Proposal] = []
+        found: list[SplitCandidate] = []
         for count in range(1, _MOST_BLOCKS + 1):
             size = max(1, round(TEST_SHARE * total / count))
             if found and size < _LEAST_BLOCK:
@@ -146,7 +146,7 @@ class _Advisor:
             sparse[rows[near & (split[rows] == "train")]] = "unused"
         return sparse if _is_whole(sparse) else split
 
-    def with_validation(self, proposal: Proposal) -> Proposal:
+    def with_validation(self, proposal: SplitCandidate) -> SplitCandidate:
         """Mark training frames for validation: a block, after a gap, or a recording.
 
         What is taken is as far from the rest as test frames are, and leaves those no farther than they were, both as
@@ -224,7 +224,7 @@ class _Advisor:
         split[test] = "test"
         return split
 
-    def _measured(self, kind: Kind, how: str, split: NDArray[np.str_]) -> Proposal:
+    def _measured(self, kind: Kind, how: str, split: NDArray[np.str_]) -> SplitCandidate:
         return measured(kind, how, split, self.capture, self.motion)
 
 

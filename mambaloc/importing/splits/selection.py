@@ -25,14 +25,14 @@ ASKED = ("auto", *KINDS)
 
 NEAR_STEPS = 2.0
 MOST_NEAR = 0.1
-REACH = 0.25
-REACH_DEG = 30.0
+COVERAGE_RADIUS = 0.25
+COVERAGE_DEG = 30.0
 RULE = (
-    f"A proposal is honest where at most {MOST_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
-    f"training frame, and learnable where the median test frame's nearest one is within {REACH:.0%} of the scene's "
-    f"extent and {REACH_DEG:g}°. A given split is taken, whatever it measures. Of the others, the first that is both "
-    f"is taken, in the order {', '.join(KINDS[1:])}; failing that, the one with the fewest near frames of those that "
-    "are learnable, or of all, and then the nearest."
+    f"A split is honest where at most {MOST_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
+    f"training frame, and learnable where the median test frame's nearest one is within {COVERAGE_RADIUS:.0%} of the "
+    f"scene's extent and {COVERAGE_DEG:g}°. A given split is taken, whatever it measures. Of the others, the first "
+    f"that is both is taken, in the order {', '.join(KINDS[1:])}; failing that, the one with the fewest near frames of "
+    "those that are learnable, or of all, and then the nearest."
 )
 
 _MEASURED = 400  # test frames at most, evenly spread
@@ -41,7 +41,7 @@ Quantiles = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Proposal:
+class SplitCandidate:
     """A way to split a capture.
 
     Args:
@@ -52,7 +52,7 @@ class Proposal:
         turn_deg: quantiles of the angle to its view direction.
         steps: quantiles of the distance in median frame spacings.
         near: share of test frames within :data:`NEAR_STEPS` steps.
-        is_learnable: the median is within reach.
+        is_covered: the median is within reach.
     """
 
     kind: Kind
@@ -62,17 +62,17 @@ class Proposal:
     turn_deg: Quantiles
     steps: Quantiles
     near: float
-    is_learnable: bool
+    is_covered: bool
 
     @property
-    def is_honest(self) -> bool:
+    def is_leak_free(self) -> bool:
         """Whether hardly any test frame is a training frame's neighbour."""
         return self.near <= MOST_NEAR
 
     @property
     def is_good(self) -> bool:
         """Whether it is honest and learnable."""
-        return self.is_honest and self.is_learnable
+        return self.is_leak_free and self.is_covered
 
     @property
     def counts(self) -> dict[str, int]:
@@ -91,21 +91,21 @@ class Proposal:
                 for name, told in quantiles.items()
             },
             f"within_{NEAR_STEPS:g}_steps": round(self.near, 4),
-            "honest": self.is_honest,
-            "learnable": self.is_learnable,
+            "honest": self.is_leak_free,
+            "learnable": self.is_covered,
         }
 
 
 @dataclass(frozen=True)
-class Chosen:
+class SelectedSplit:
     """A proposal, why it was taken, and what is wrong with it still; empty where nothing is."""
 
-    proposal: Proposal
+    proposal: SplitCandidate
     why: str
     warning: str
 
 
-def choose(proposals: Sequence[Proposal], asked: str, capture: Capture) -> Chosen:
+def choose(proposals: Sequence[SplitCandidate], asked: str, capture: Capture) -> SelectedSplit:
     """Take a proposal: the one asked for, or by :data:`RULE`.
 
     Args:
@@ -122,7 +122,7 @@ def choose(proposals: Sequence[Proposal], asked: str, capture: Capture) -> Chose
             there = ", ".join(each.kind for each in proposals)
             lacks = _lacks_given(capture) if asked == "given" else _LACKS[asked]
             raise InputError(f"--split {asked}: this capture has {lacks}; choose one of auto, {there}")
-        return Chosen(taken, "it was asked for", _warning(taken, capture))
+        return SelectedSplit(taken, "it was asked for", _warning(taken, capture))
     given = next((each for each in proposals if each.kind == "given"), None)
     taken = given or next((each for each in proposals if each.is_good), None) or best_of(proposals)
     if given:
@@ -131,7 +131,7 @@ def choose(proposals: Sequence[Proposal], asked: str, capture: Capture) -> Chose
         why = "the first that is honest and learnable"
     else:
         why = "none is both honest and learnable, it comes nearest"
-    return Chosen(taken, why, _warning(taken, capture))
+    return SelectedSplit(taken, why, _warning(taken, capture))
 
 
 _LACKS = {
@@ -149,18 +149,20 @@ def _lacks_given(capture: Capture) -> str:
     return f"a split of its own with {counts} whose poses and images can be used, and both are needed"
 
 
-def best_of(proposals: Sequence[Proposal]) -> Proposal:
+def best_of(proposals: Sequence[SplitCandidate]) -> SplitCandidate:
     """The one with the fewest near frames of those that are learnable, or of all; among honest ones, the nearest."""
-    return min(proposals, key=lambda each: (not each.is_learnable, max(each.near, MOST_NEAR), each.steps[1]))
+    return min(proposals, key=lambda each: (not each.is_covered, max(each.near, MOST_NEAR), each.steps[1]))
 
 
-def measured(kind: Kind, how: str, split: NDArray[np.str_], capture: Capture, motion: Motion) -> Proposal:
+def measured(kind: Kind, how: str, split: NDArray[np.str_], capture: Capture, motion: Motion) -> SplitCandidate:
     """Measure how far test frames are from training frames."""
     test, train = np.flatnonzero(split == "test"), np.flatnonzero(split == "train")
     length, turn_deg, steps = distances(capture, motion, test, train)
-    is_learnable = bool(np.median(length) <= REACH * motion.extent and np.median(turn_deg) <= REACH_DEG)
+    is_covered = bool(np.median(length) <= COVERAGE_RADIUS * motion.extent and np.median(turn_deg) <= COVERAGE_DEG)
     near = float((steps <= NEAR_STEPS).mean())
-    return Proposal(kind, how, split, _quantiles(length), _quantiles(turn_deg), _quantiles(steps), near, is_learnable)
+    return SplitCandidate(
+        kind, how, split, _quantiles(length), _quantiles(turn_deg), _quantiles(steps), near, is_covered
+    )
 
 
 def distances(
@@ -183,14 +185,14 @@ def _quantiles(values: NDArray[np.float64]) -> Quantiles:
     return low, middle, high
 
 
-def _warning(taken: Proposal, capture: Capture) -> str:
+def _warning(taken: SplitCandidate, capture: Capture) -> str:
     listed = f"the capture has {capture.split_concern}" if capture.split_concern else ""
-    if not taken.is_honest:
+    if not taken.is_leak_free:
         warning = (
             f"the split by {taken.kind} leaks: {taken.near:.0%} of test frames are within {NEAR_STEPS:g} steps of a "
             "training frame, so test errors will look better than those between the frames"
         )
-    elif not taken.is_learnable:
+    elif not taken.is_covered:
         warning = (
             f"the split by {taken.kind} asks much: half of its test frames are {taken.steps[1]:.0f} steps or more "
             f"({taken.turn_deg[1]:.0f}°) from any training frame; record more passes"

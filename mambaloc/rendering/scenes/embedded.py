@@ -20,7 +20,7 @@ from mambaloc.rendering.scenes.layouts import (
     scene_note,
     write_7scenes,
 )
-from mambaloc.rendering.scenes.shots import Shot, shots_of_sequences
+from mambaloc.rendering.scenes.shots import Frame, frames_of_sequences
 from mambaloc.rendering.trajectories import smooth_trajectory
 
 EMBEDDED_SCENE = "room"
@@ -47,7 +47,7 @@ def ensure_embedded_scene(root: Path) -> Path:
     Raises:
         InputError: if both names are taken by something else.
     """
-    shots = embedded_shots()
+    shots = embedded_frames()
     note = scene_note(shots, _SIZE, _SEED)
     names = (EMBEDDED_SCENE, f"{EMBEDDED_SCENE}-v{GENERATOR_VERSION}")
     if folder := _rendered(root, names, note):
@@ -69,13 +69,13 @@ def ensure_embedded_scene(root: Path) -> Path:
     raise InputError(f"{root / names[-1]}: was rendered by another version; remove it, or choose another root")
 
 
-def embedded_shots() -> list[Shot]:
+def embedded_frames() -> list[Frame]:
     """The frames of the embedded scene: four sequences to train on and two to test on, in the same volume."""
     sequences = {
         number: embedded_walk(_FRAMES // 2 if number in _TEST else _FRAMES, number, start_deg, _STEP_DEG)
         for number, start_deg in _STARTS_DEG.items()
     }
-    return shots_of_sequences(sequences, _TEST, "seq-{sequence:02d}/frame-{frame:06d}.color.jpg")
+    return frames_of_sequences(sequences, _TEST, "seq-{sequence:02d}/frame-{frame:06d}.color.jpg")
 
 
 def embedded_room() -> Room:
@@ -88,7 +88,7 @@ def embedded_walk(frames: int, seed: int, start_deg: float, step_deg: float) -> 
     return smooth_trajectory(frames, seed=seed, inside_m=_INSIDE_M, start_deg=start_deg, step_deg=step_deg)
 
 
-def _add_missing_depth(folder: Path, shots: Iterable[Shot]) -> None:
+def _add_missing_depth(folder: Path, shots: Iterable[Frame]) -> None:
     due = [shot for shot in shots if has_depth(shot, _DEPTH_EVERY)]
     if all((folder / depth_file(shot)).is_file() for shot in due):
         return

@@ -23,7 +23,7 @@ from mambaloc.errors import InputError
 from mambaloc.rendering.quads import Image, Room
 from mambaloc.rendering.renderer import default_intrinsics, render, sensor
 from mambaloc.rendering.room import room_around
-from mambaloc.rendering.scenes.shots import Shot
+from mambaloc.rendering.scenes.shots import Frame
 from mambaloc.rendering.scenes.tracks import write_nvm
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
@@ -38,7 +38,7 @@ _SPLIT_TITLES = {"train": "Train", "test": "Test"}
 def write_7scenes(
     root: Path,
     scene: str,
-    shots: Sequence[Shot],
+    shots: Sequence[Frame],
     *,
     room: Room | None = None,
     size: tuple[int, int] = (320, 240),
@@ -72,7 +72,7 @@ def write_7scenes(
         if sequences.setdefault(int(match[1]), shot.split) != shot.split:
             raise InputError(f"{shot.image}: 7-Scenes splits by whole sequences; put sequence {match[1]} in one split")
 
-    def write_labels(image: Path, shot: Shot, depth_m: NDArray[np.float32]) -> None:
+    def write_labels(image: Path, shot: Frame, depth_m: NDArray[np.float32]) -> None:
         stem = image.name.partition(".")[0]
         np.savetxt(image.with_name(f"{stem}.pose.txt"), shot.world_from_cam, fmt="% .10e", delimiter="\t")
         if depth and has_depth(shot, depth_every):
@@ -89,7 +89,7 @@ def write_7scenes(
 def write_cambridge(
     root: Path,
     scene: str,
-    shots: Sequence[Shot],
+    shots: Sequence[Frame],
     *,
     room: Room | None = None,
     size: tuple[int, int] = (320, 240),
@@ -103,7 +103,7 @@ def write_cambridge(
     """
     depths_m: dict[str, NDArray[np.float16]] = {}
 
-    def keep_depth(image: Path, shot: Shot, depth_m: NDArray[np.float32]) -> None:
+    def keep_depth(image: Path, shot: Frame, depth_m: NDArray[np.float32]) -> None:
         depths_m[shot.image] = depth_m.astype(np.float16)
 
     with _new_folder(root, scene) as folder:
@@ -116,7 +116,7 @@ def write_cambridge(
     return root / scene
 
 
-def scene_note(shots: Sequence[Shot], size: tuple[int, int], seed: int) -> dict[str, Any]:
+def scene_note(shots: Sequence[Frame], size: tuple[int, int], seed: int) -> dict[str, Any]:
     """What ``scene.json`` says: enough to render the scene again, and that it is not the real one."""
     return {
         "rendered_by": "mambaloc.rendering",
@@ -128,17 +128,17 @@ def scene_note(shots: Sequence[Shot], size: tuple[int, int], seed: int) -> dict[
     }
 
 
-def has_depth(shot: Shot, every: int) -> bool:
+def has_depth(shot: Frame, every: int) -> bool:
     """Whether a 7-Scenes frame is among those with depth: every so many-th of its sequence, by its number."""
     return int(Path(shot.image).name.partition(".")[0].removeprefix("frame-")) % every == 0
 
 
-def depth_file(shot: Shot) -> str:
+def depth_file(shot: Frame) -> str:
     """Where a 7-Scenes frame's depth lies, relative to the scene's folder."""
     return f"{shot.image.partition('.')[0]}.depth.png"
 
 
-def add_depth(folder: Path, shots: Sequence[Shot], room: Room, size: tuple[int, int]) -> None:
+def add_depth(folder: Path, shots: Sequence[Frame], room: Room, size: tuple[int, int]) -> None:
     """Write the depth frames of some shots of a scene that is there already, each complete or not at all."""
     with TemporaryDirectory(prefix=".depth-", dir=folder) as draft, ThreadPoolExecutor(os.cpu_count()) as pool:
 
@@ -170,11 +170,11 @@ def _new_folder(root: Path, scene: str) -> Iterator[Path]:
 
 def _render_all(
     folder: Path,
-    shots: Sequence[Shot],
+    shots: Sequence[Frame],
     room: Room | None,
     size: tuple[int, int],
     seed: int,
-    write_labels: Callable[[Path, Shot, NDArray[np.float32]], None] | None = None,
+    write_labels: Callable[[Path, Frame, NDArray[np.float32]], None] | None = None,
 ) -> None:
     """Take every image into its file, and write what all layouts share."""
     if not shots:
@@ -216,7 +216,7 @@ def _write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
     _write_image(path, depth_mm.astype(np.uint16))
 
 
-def _cambridge_line(shot: Shot) -> str:
+def _cambridge_line(shot: Frame) -> str:
     # The inverse of a rotation is its transpose: the labels turn the world into the camera.
     cam_from_world = quaternion_from_matrix(shot.world_from_cam[:3, :3].T)
     numbers = [*shot.world_from_cam[:3, 3], *cam_from_world]

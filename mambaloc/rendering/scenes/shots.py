@@ -24,7 +24,7 @@ _COLUMNS = ("scene", "split", "image", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class Frame:
     """One image to take: its file, relative to the scene's folder, its split, and the camera's pose.
 
     Shape:
@@ -36,9 +36,9 @@ class Shot:
     world_from_cam: Vectors
 
 
-def shots_of_sequences(
+def frames_of_sequences(
     sequences: Mapping[int, Vectors], test: Collection[int], image: str = FRAME_7SCENES
-) -> list[Shot]:
+) -> list[Frame]:
     """The shots of whole sequences, in order.
 
     Args:
@@ -47,13 +47,13 @@ def shots_of_sequences(
         image: a frame's file name, with the fields ``sequence`` and ``frame``.
     """
     return [
-        Shot(image.format(sequence=number, frame=frame), "test" if number in test else "train", world_from_cam)
+        Frame(image.format(sequence=number, frame=frame), "test" if number in test else "train", world_from_cam)
         for number, poses in sequences.items()
         for frame, world_from_cam in enumerate(poses)
     ]
 
 
-def read_pose_table(path: Path, scene: str, layout: Layout) -> list[Shot]:
+def read_pose_table(path: Path, scene: str, layout: Layout) -> list[Frame]:
     """The shots of one scene of a table ``scene,split,image,x,y,z,qw,qx,qy,qz``, file names kept.
 
     The position is the camera centre in metres. The quaternion is what the dataset's own labels hold:
@@ -94,7 +94,7 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def thinned(shots: Iterable[Shot], limit: int) -> list[Shot]:
+def thinned(shots: Iterable[Frame], limit: int) -> list[Frame]:
     """At most ``limit`` shots of each split, evenly spaced.
 
     Raises:
@@ -102,7 +102,7 @@ def thinned(shots: Iterable[Shot], limit: int) -> list[Shot]:
     """
     if limit < 1:
         raise InputError(f"limit {limit}: a split keeps at least one frame; give 1 or more")
-    by_split: dict[str, list[Shot]] = {}
+    by_split: dict[str, list[Frame]] = {}
     for shot in shots:
         by_split.setdefault(shot.split, []).append(shot)
     return [
@@ -112,7 +112,7 @@ def thinned(shots: Iterable[Shot], limit: int) -> list[Shot]:
     ]
 
 
-def _shot(row: Mapping[str, str], layout: Layout, where: str) -> Shot:
+def _shot(row: Mapping[str, str], layout: Layout, where: str) -> Frame:
     try:
         numbers = np.array([float(row[name]) for name in _COLUMNS[3:]])
     except (TypeError, ValueError):
@@ -128,4 +128,4 @@ def _shot(row: Mapping[str, str], layout: Layout, where: str) -> Shot:
     world_from_cam = np.eye(4)
     world_from_cam[:3, :3] = rotation if layout == "7scenes" else rotation.T
     world_from_cam[:3, 3] = numbers[:3]
-    return Shot(image, row["split"], world_from_cam)
+    return Frame(image, row["split"], world_from_cam)

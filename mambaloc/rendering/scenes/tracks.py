@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.rendering.quads import Vectors
-from mambaloc.rendering.scenes.shots import Shot
+from mambaloc.rendering.scenes.shots import Frame
 from mambaloc.runtime.rotations import quaternion_from_matrix
 
 _POINTS = 4000  # in all: about as many in an image as a real model has
@@ -17,7 +17,7 @@ _DEPTH_TOLERANCE = 0.02  # of the depth; the nearest pixel's is compared, which 
 
 
 def write_nvm(
-    path: Path, shots: Sequence[Shot], depth_m: Mapping[str, NDArray[np.floating]], intrinsics: Vectors, seed: int
+    path: Path, shots: Sequence[Frame], depth_m: Mapping[str, NDArray[np.floating]], intrinsics: Vectors, seed: int
 ) -> None:
     """Write cameras and points as Cambridge Landmarks ships them, its images named ``.jpg``.
 
@@ -46,7 +46,7 @@ def write_nvm(
         file.write("\n0\n")
 
 
-def _drawn(shot: Shot, depth_m: NDArray[np.floating], intrinsics: Vectors, seed: int, shots: int) -> Vectors:
+def _drawn(shot: Frame, depth_m: NDArray[np.floating], intrinsics: Vectors, seed: int, shots: int) -> Vectors:
     """One image's share of the points: where some of its pixels are in the world, (K, 3)."""
     rng = np.random.default_rng([seed, *shot.image.encode()])
     filled = np.flatnonzero(depth_m)
@@ -57,7 +57,7 @@ def _drawn(shot: Shot, depth_m: NDArray[np.floating], intrinsics: Vectors, seed:
 
 
 def _seen(
-    points_m: Vectors, shot: Shot, depth_m: NDArray[np.floating], intrinsics: Vectors
+    points_m: Vectors, shot: Frame, depth_m: NDArray[np.floating], intrinsics: Vectors
 ) -> tuple[NDArray[np.int64], Vectors]:
     """Which points an image shows, (K,), and at which pixels, (K, 2)."""
     points_cam = (points_m - shot.world_from_cam[:3, 3]) @ shot.world_from_cam[:3, :3]
@@ -71,7 +71,7 @@ def _seen(
     return ahead[agrees], pixels[agrees]
 
 
-def _camera_line(shot: Shot, intrinsics: Vectors) -> str:
+def _camera_line(shot: Frame, intrinsics: Vectors) -> str:
     cam_from_world = quaternion_from_matrix(shot.world_from_cam[:3, :3].T)
     numbers = [intrinsics[0, 0], *cam_from_world, *shot.world_from_cam[:3, 3]]
     return f"{PurePosixPath(shot.image).with_suffix('.jpg')}\t{' '.join(f'{number:.9f}' for number in numbers)} 0 0\n"

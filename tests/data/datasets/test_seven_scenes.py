@@ -15,7 +15,7 @@ from mambaloc.data.datasets.registry import is_official
 from mambaloc.data.datasets.seven_scenes import OFFICIAL_COUNTS, read_split
 from mambaloc.data.frames import BadFrames
 from mambaloc.errors import InputError
-from mambaloc.rendering import shots_of_sequences, write_7scenes
+from mambaloc.rendering import frames_of_sequences, write_7scenes
 
 SPEC_COUNTS = {
     "chess": (4000, 2000),
@@ -63,7 +63,7 @@ def test_rendered_scene_reads_back(tmp_path):
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("xyz", np.random.default_rng(0).uniform(-1, 1, (4, 3))).as_matrix()
     poses[:, :3, 3] = np.random.default_rng(1).uniform(-1, 1, (4, 3))
-    shots = shots_of_sequences({1: poses[:3], 2: poses[3:]}, test=(2,))
+    shots = frames_of_sequences({1: poses[:3], 2: poses[3:]}, test=(2,))
     folder = write_7scenes(tmp_path, "drawn", shots, size=(32, 24))
     expected = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
     for split, rows in (("train", slice(0, 3)), ("test", slice(3, 4))):

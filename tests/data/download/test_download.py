@@ -361,7 +361,7 @@ def test_an_interrupted_unpack_leaves_nothing(server: Server, tmp_path: Path, mo
 
 def test_a_damaged_archive_leaves_no_scene(server: Server, tmp_path: Path) -> None:
     at = HEADS.index(NOISE[:100])
-    with pytest.raises(InputError, match=r"heads.zip.* no zip that can be read .*delete it and download it again"):
+    with pytest.raises(InputError, match=r"heads.zip.* cannot be read as a zip .*Delete it and download it again"):
         get(server.source(HEADS[:at] + b"?" + HEADS[at + 1 :]), tmp_path)
     assert left_in(tmp_path) == {"heads.zip"}
 
@@ -378,7 +378,7 @@ def test_a_scene_that_lacks_a_sequence_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "heads/TrainSplit.txt").write_text("sequence2")
     (tmp_path / "heads/TestSplit.txt").write_text("sequence1")
     (tmp_path / "heads/seq-02").mkdir()
-    with pytest.raises(InputError, match=r"heads is there but lacks seq-01: move the folder away"):
+    with pytest.raises(InputError, match=r"heads: the folder exists, but seq-01 is missing. Move the folder away"):
         download("7scenes", "heads", tmp_path)
 
 

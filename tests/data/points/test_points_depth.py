@@ -14,7 +14,7 @@ from mambaloc.data.datasets.seven_scenes import read_split
 from mambaloc.data.frames import BadFrames, Cameras, Frames
 from mambaloc.data.points import ScenePoints, read_points
 from mambaloc.errors import InputError
-from mambaloc.rendering import default_intrinsics, furnished_room, shots_of_sequences, write_7scenes
+from mambaloc.rendering import default_intrinsics, frames_of_sequences, furnished_room, write_7scenes
 from mambaloc.rendering.trajectories import smooth_trajectory
 
 SIZE = (96, 72)
@@ -25,7 +25,7 @@ DEPTH_EVERY = 5
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory) -> Path:
     """Two training sequences of 12 frames, depth for frames 0, 5 and 10 of each."""
-    shots = shots_of_sequences({n: smooth_trajectory(12, n, INSIDE_M) for n in (1, 2)}, test=())
+    shots = frames_of_sequences({n: smooth_trajectory(12, n, INSIDE_M) for n in (1, 2)}, test=())
     room = furnished_room(INSIDE_M, seed=0, px_per_m=30)
     root = tmp_path_factory.mktemp("depth")
     return write_7scenes(root, "den", shots, room=room, size=SIZE, depth=True, depth_every=DEPTH_EVERY)
@@ -205,7 +205,7 @@ def test_a_damaged_depth_frame_is_named(tiny, damage):
         file.write_bytes(content[damage])
     else:
         cv2.imwrite(str(file), np.zeros((24, 32) if damage == "8 bit" else (24, 32, 3), np.uint8))
-    assert "frame-000001.depth.png: is no whole 16-bit PNG of one channel" in one_line(tiny.folder)
+    assert "frame-000001.depth.png: is not a complete 16-bit PNG of one channel" in one_line(tiny.folder)
 
 
 def test_depth_of_another_size_is_named(tiny):

@@ -15,7 +15,7 @@ from mambaloc.data.datasets.cambridge import read_split
 from mambaloc.data.frames import BadFrames, Frames
 from mambaloc.data.points import ScenePoints, colmap, read_points
 from mambaloc.errors import InputError, InputWarning
-from mambaloc.rendering import default_intrinsics, furnished_room, render, shots_of_sequences, write_cambridge
+from mambaloc.rendering import default_intrinsics, frames_of_sequences, furnished_room, render, write_cambridge
 from mambaloc.rendering.trajectories import smooth_trajectory
 
 SIZE = (96, 72)
@@ -37,7 +37,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory, room) -> Path:
-    shots = shots_of_sequences(
+    shots = frames_of_sequences(
         {n: smooth_trajectory(6, n, INSIDE_M) for n in (1, 2)}, test=(2,), image="seq{sequence}/frame{frame:05d}.png"
     )
     return write_cambridge(tmp_path_factory.mktemp("nvm"), "Yard", shots, room=room, size=SIZE, points=True)
@@ -89,7 +89,7 @@ def test_rendered_tracks_hold_the_pixels_that_opencv_projects(rendered):
 
 
 def test_the_pictures_do_not_depend_on_the_points(rendered, room, tmp_path):
-    shots = shots_of_sequences({1: smooth_trajectory(2, 1, INSIDE_M)}, (), "seq{sequence}/frame{frame:05d}.png")
+    shots = frames_of_sequences({1: smooth_trajectory(2, 1, INSIDE_M)}, (), "seq{sequence}/frame{frame:05d}.png")
     plain = write_cambridge(tmp_path, "Plain", shots, room=room, size=SIZE)
     assert not (plain / "reconstruction.nvm").exists()
     for shot in shots:
@@ -346,7 +346,7 @@ def test_a_count_that_lies_costs_no_memory(yard):
         file.write_bytes(whole[:place] + b"\xff" * 7 + whole[place + 7 :])
         with (
             mock.patch("pycolmap.Reconstruction", side_effect=AssertionError("COLMAP would believe the count")),
-            pytest.raises(InputError, match=r"points3D\.bin: is cut off or counts more than it holds"),
+            pytest.raises(InputError, match=r"points3D\.bin: is truncated"),
         ):
             read(yard)
 

@@ -174,7 +174,7 @@ def test_pictures_without_camera_are_compared_with_a_guess(written):
 
 def test_poses_of_no_camera_are_a_concern_without_one(written):
     capture = replace(written, cameras={}, camera_of=None, world_from_cam=np.roll(written.world_from_cam, 20, axis=0))
-    assert "no focal length makes more of them agree than chance" in checked(capture)[0].concern
+    assert "no focal length makes more agree than chance" in checked(capture)[0].concern
 
 
 def test_too_few_matches_are_no_evidence():

@@ -144,7 +144,7 @@ def test_several_cameras_are_told_apart(recording, tmp_path):
 def test_names_that_lead_out_are_refused(recording, tmp_path, refused, names):
     write_model(recording, tmp_path / "sparse", names=names + NAMES[1:])
     recording.write(tmp_path / "images", NAMES)
-    refused(read_colmap, tmp_path, "which is not a file inside of")
+    refused(read_colmap, tmp_path, "which is not a file inside")
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "frames.bin", "points3D.bin", "rigs.bin"])
@@ -155,7 +155,7 @@ def test_a_cut_file_is_named_in_one_line(recording, tmp_path, refused, file, sha
     whole = (tmp_path / file).read_bytes()
     (tmp_path / file).write_bytes(whole[: int(share * len(whole))])
     with mock.patch("pycolmap.Reconstruction", side_effect=AssertionError("COLMAP would read past the end")):
-        refused(read_colmap, tmp_path, f"{file}: is cut off or counts more than it holds")
+        refused(read_colmap, tmp_path, f"{file}: is truncated")
 
 
 @pytest.mark.parametrize(

@@ -186,12 +186,12 @@ HEADER = "image,x,y,z,qw,qx,qy,qz\n"
             HEADER.replace("x,y,z", "x [m],y [m],z [ft]") + ROW,
             "line 1: positions are in no one unit of length (x [m], y [m], z [ft]). Write x, y and z in metres.",
         ),
-        (HEADER + ROW + "a.jpg,0,0\n", "line 3: has 3 fields where the first line names 8"),
+        (HEADER + ROW + "a.jpg,0,0\n", "line 3: has 3 fields, but the first line names 8"),
         (HEADER + ROW.replace("1", "one"), "line 2: x,y,z,qw,qx,qy,qz must be numbers"),
         (HEADER + ROW.replace("1", "0.1"), "line 2: the quaternion is far from unit length"),
-        (HEADER + ROW.replace("a.jpg", "../b.jpg"), "line 2: names '../b.jpg', which is not a file inside of"),
-        (HEADER + ROW.replace("a.jpg", "/b.jpg"), "line 2: names '/b.jpg', which is not a file inside of"),
-        (HEADER + ROW.replace("a.jpg", ""), "line 2: names '', which is not a file inside of"),
+        (HEADER + ROW.replace("a.jpg", "../b.jpg"), "line 2: names '../b.jpg', which is not a file inside"),
+        (HEADER + ROW.replace("a.jpg", "/b.jpg"), "line 2: names '/b.jpg', which is not a file inside"),
+        (HEADER + ROW.replace("a.jpg", ""), "line 2: names '', which is not a file inside"),
         (HEADER + ROW, "has no image with a pose"),
         (
             HEADER.replace("image", "split,image") + "holdout," + ROW,
@@ -210,10 +210,10 @@ def test_damage_is_named_in_one_line(tmp_path, recording, refused, content, says
 
 
 def test_several_tables_or_none(folder, recording, refused):
-    refused(read_csv, folder / "den" / "seq-01", "holds not one CSV file but none")
+    refused(read_csv, folder / "den" / "seq-01", "contains no CSV file")
     for name in ("train.csv", "test.csv"):
         (folder / name).write_text(lines(recording, OURS))
-    refused(read_csv, folder, "holds not one CSV file but test.csv, train.csv")
+    refused(read_csv, folder, "has several CSV files: test.csv, train.csv")
 
 
 def test_real_poses_are_those_of_the_table(recording, tmp_path):

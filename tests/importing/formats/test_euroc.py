@@ -156,7 +156,7 @@ BAD = {
     "'T_BS' must be 16 finite numbers": (CAM, {"T_BS": {"data": [1.0] * 12}}),
     "'intrinsics' must be 4 finite numbers": (CAM, {"intrinsics": "none"}),
     "T_BS: the pose's rotation is not orthonormal": (CAM, {"T_BS": {"data": [2.0, *[0.0] * 14, 1.0]}}),
-    "T_BS is not a rotation and shift": (CAM, {"T_BS": {"data": [0.0] * 15 + [1.0]}}),
+    "T_BS is not a rotation and translation": (CAM, {"T_BS": {"data": [0.0] * 15 + [1.0]}}),
     "sensor.yaml: is not YAML": (CAM, "a: [1"),
     "sensor.yaml: is not YAML ": (CAM, "a: " + "9" * 5000),
     "sensor.yaml: contains no calibration": (CAM, "- 1"),

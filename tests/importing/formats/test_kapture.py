@@ -181,9 +181,9 @@ BAD = [
     ("sensors.txt", "PINHOLE, 320", "OPENCV, 320", "sensors.txt, line 3: OPENCV must have 10 finite numbers"),
     ("sensors.txt", "PINHOLE, 320", "PINHOLE, 0", "sensors.txt, line 3: a camera must have a size"),
     ("sensors.txt", "cam0,", "cam9,", "records_camera.txt, line 2: sensor 'cam0' is not a camera of sensors.txt"),
-    ("records_camera.txt", "left/00000.png", "../00000.png", "names '../00000.png', which is not a file inside of"),
+    ("records_camera.txt", "left/00000.png", "../00000.png", "names '../00000.png', which is not a file inside"),
     ("records_camera.txt", ", cam0, left/00000.png", ", cam0", "line 2: is not a row timestamp, sensor, image"),
-    ("records_camera.txt", f"{FIRST}, ", "noon, ", "line 2: time stamp 'noon' is no whole number"),
+    ("records_camera.txt", f"{FIRST}, ", "noon, ", "line 2: time stamp 'noon' is not an integer"),
     ("trajectories.txt", f"{FIRST}, cam0, ", f"{FIRST}, cam0, x", "line 2: is not a quaternion and translation"),
 ]
 

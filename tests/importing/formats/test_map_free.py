@@ -86,7 +86,7 @@ def test_pictures_without_a_camera_have_none_at_all(source):
     ("file", "line", "says"),
     [
         ("poses.txt", "seq0/frame_00000.png 1 0 0 0 0 0", "line 1: is not a line 'name qw qx qy qz tx ty tz'"),
-        ("poses.txt", "../a.png 1 0 0 0 0 0 0", "names '../a.png', which is not a file inside of"),
+        ("poses.txt", "../a.png 1 0 0 0 0 0 0", "names '../a.png', which is not a file inside"),
         ("intrinsics.txt", "seq0/frame_00000.png 0 300 160 120 320 240", "intrinsics.txt, line 1: a camera must have"),
         ("intrinsics.txt", "seq0/frame_00000.png 9 9 900 120 320 240", "principal point 900, 120 is far from"),
     ],

@@ -280,27 +280,25 @@ BAD = {
     "has no list of 'frames'": lambda told: {},
     "is not a JSON object; it holds 'frames'": lambda told: [],
     "has no list of 'frames' ": top(frames=[1]),
-    "frame 1: file_path: names 'None', which is not a file inside of": frame("file_path", None),
-    "frame 1: file_path: names '../../secret.png', which is not a file inside of": frame(
-        "file_path", "../../secret.png"
-    ),
-    "frame 1: file_path: names '/etc/passwd', which is not a file inside of": frame("file_path", "/etc/passwd"),
-    "frame 1: file_path: names 'C:\\\\a.png', which is not a file inside of": frame("file_path", "C:\\a.png"),
-    "aaaaaa', which is not a file inside of": frame("file_path", "a" * 253),  # too long with a suffix
+    "frame 1: file_path: names 'None', which is not a file inside": frame("file_path", None),
+    "frame 1: file_path: names '../../secret.png', which is not a file inside": frame("file_path", "../../secret.png"),
+    "frame 1: file_path: names '/etc/passwd', which is not a file inside": frame("file_path", "/etc/passwd"),
+    "frame 1: file_path: names 'C:\\\\a.png', which is not a file inside": frame("file_path", "C:\\a.png"),
+    "aaaaaa', which is not a file inside": frame("file_path", "a" * 253),  # too long with a suffix
     "images/a_2.png more than one pose; remove all but one": frame("file_path", "images/a_2.png"),
-    "tells a focal length of some frames, not of": lambda told: frame("fl_x", 30.0)(without(told, "fl_x")),
-    "camera of a_1.png: fl_x is 'wide', no finite number": frame("fl_x", "wide"),
-    "camera of a_1.png: fl_x is 'nan', no finite number": frame("fl_x", math.nan),
-    "camera of a_1.png: k1 is 'True', no finite number": frame("k1", True),
+    "some frames have a focal length": lambda told: frame("fl_x", 30.0)(without(told, "fl_x")),
+    "camera of a_1.png: fl_x is 'wide', not a finite number": frame("fl_x", "wide"),
+    "camera of a_1.png: fl_x is 'nan', not a finite number": frame("fl_x", math.nan),
+    "camera of a_1.png: k1 is 'True', not a finite number": frame("k1", True),
     "focal length -5: correct it": frame("fl_x", -5),
     "1e+09x24 pixels": frame("w", 1e9),
     "32767x24 pixels": frame("w", 32767),
-    "is far outside of the image": frame("cx", 1e6),
+    "is far outside the image": frame("cx", 1e6),
     "camera_angle_x is 4": lambda told: top(camera_angle_x=4)(without(told, "fl_x", "fl_y")),
     "camera_model 'EQUIRECTANGULAR' is not read": frame("camera_model", "EQUIRECTANGULAR"),
-    "k4 is 0.1, which OpenCV's lens has not": frame("k4", 0.1),
+    "k4 is 0.1, which OpenCV's lens does not have": frame("k4", 0.1),
     "applied_scale is 0": top(applied_scale=0),
-    "applied_transform is not a rotation and shift": top(applied_transform=[[2, 0, 0, 0]] * 3),
+    "applied_transform is not a rotation and translation": top(applied_transform=[[2, 0, 0, 0]] * 3),
     "applied_transform is not a 4x4": top(applied_transform="z up"),
     "train_filenames is not a list": top(train_filenames=3),
 }
@@ -369,7 +367,7 @@ def test_no_image_can_be_decoded(write, tmp_path):
 
 def test_a_folder_of_something_else(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(InputError, match="looks like no format that is known"):
+    with pytest.raises(InputError, match="the format is not recognized"):
         read_capture(tmp_path)
     with pytest.raises(InputError, match=r"contains none of transforms\.json"):
         read_capture(tmp_path, "nerfstudio")

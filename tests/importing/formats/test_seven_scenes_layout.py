@@ -38,7 +38,7 @@ def test_depth_may_be_absent(scenes, tmp_path):
 @pytest.mark.parametrize(
     ("file", "says"),
     [
-        ("seq-01/frame-000000.depth.png", "is no whole 16-bit PNG"),
+        ("seq-01/frame-000000.depth.png", "is not a complete 16-bit PNG"),
         ("camera-intrinsics.txt", "is not a pinhole matrix"),
         ("TrainSplit.txt", "lists no sequence"),
     ],

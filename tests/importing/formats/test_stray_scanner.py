@@ -128,7 +128,7 @@ def test_a_damaged_confidence_map_is_named(source, damage):
     cv2.imwrite(str(file), np.ones(shape, kind))
     if damage == "cut":
         file.write_bytes(file.read_bytes()[:-9])
-    with pytest.raises(InputError, match=rf"confidence/{number:06d}\.png: is no whole 8-bit PNG") as caught:
+    with pytest.raises(InputError, match=rf"confidence/{number:06d}\.png: is not a complete 8-bit PNG") as caught:
         sampled(read_capture(source).depth, 0, np.zeros((1, 2)))
     assert "\n" not in str(caught.value)
 

@@ -130,7 +130,7 @@ def test_a_trajectory_beside_images_named_by_time(recording, tmp_path):
 def test_numbers_that_are_no_time_stamps_are_not_guessed(recording, tmp_path, refused):
     recording.write(tmp_path / "rgb", [f"{k:06d}.jpg" for k in range(len(recording.jpegs))])
     (tmp_path / "trajectory.txt").write_text(trajectory(recording, [f"{k / 30:.6f}" for k in range(6)]))
-    refused(read_capture, tmp_path, "does not tell which pose is which image's", "000000.jpg", "rgb.txt")
+    refused(read_capture, tmp_path, "its poses cannot be matched to images", "000000.jpg", "rgb.txt")
 
 
 def test_quaternions_that_are_not_unit_are_made_so_and_counted(tum, recording):
@@ -152,17 +152,17 @@ def test_quaternions_that_are_not_unit_are_made_so_and_counted(tum, recording):
         ("groundtruth.txt", "1 2 3 4 0 0 0 1\n1 2 3 inf 0 0 1\n", "line 2: is not a line"),
         ("groundtruth.txt", "1 2 3 4 0 0 0 0\n", "none of 1 poses"),
         ("groundtruth.txt", f"{START_S} 2 3 4 0 0 0 0.1\n", "line 1: the quaternion is far from unit length"),
-        ("groundtruth.txt", "nan 2 3 4 0 0 0 1\n", "no time stamp in seconds"),
-        ("groundtruth.txt", "x 2 3 4 0 0 0 1\n", "no time stamp in seconds"),
+        ("groundtruth.txt", "nan 2 3 4 0 0 0 1\n", "is not a time stamp in seconds"),
+        ("groundtruth.txt", "x 2 3 4 0 0 0 1\n", "is not a time stamp in seconds"),
         ("groundtruth.txt", "\x00\xff\n", "line 1: is not a line"),
         ("rgb.txt", None, "rgb.txt: missing"),
         ("rgb.txt", "", "names no image; add lines"),
-        ("rgb.txt", "1305031102.2 ../../etc/passwd\n", "names '../../etc/passwd', which is not a file inside of"),
-        ("rgb.txt", "1305031102.2 /etc/passwd\n", "names '/etc/passwd', which is not a file inside of"),
-        ("rgb.txt", "1305031102.2 C:\\x.png\n", "which is not a file inside of"),
+        ("rgb.txt", "1305031102.2 ../../etc/passwd\n", "names '../../etc/passwd', which is not a file inside"),
+        ("rgb.txt", "1305031102.2 /etc/passwd\n", "names '/etc/passwd', which is not a file inside"),
+        ("rgb.txt", "1305031102.2 C:\\x.png\n", "which is not a file inside"),
         ("rgb.txt", "1305031102.2\n", "line 1: is not a line 'timestamp file'"),
         ("rgb.txt", "nan rgb/a.png\n", "line 1: is not a line 'timestamp file'"),
-        ("rgb.txt", f"1 {'a' * 300}.png\n", "which is not a file inside of"),
+        ("rgb.txt", f"1 {'a' * 300}.png\n", "which is not a file inside"),
         ("rgb.txt", "1 rgb/a.png\n", "1 are named and missing, such as 'rgb/a.png'"),
     ],
 )

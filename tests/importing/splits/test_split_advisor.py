@@ -50,8 +50,8 @@ def test_one_straight_recording_is_split_by_blocks():
     block = found["block"]
     assert block.counts["test"] == pytest.approx(40, abs=2)
     assert block.counts["val"] == pytest.approx(20, abs=2)
-    assert block.is_honest
-    assert block.is_learnable
+    assert block.is_leak_free
+    assert block.is_covered
     test, train = (np.flatnonzero(block.split == split) for split in ("test", "train"))
     gaps = np.abs(test[:, None] - train).min(axis=1)
     assert gaps.min() == 5  # two in a hundred frames are left out on either side
@@ -117,7 +117,7 @@ def test_a_given_split_of_every_eighth_frame_leaks_and_is_taken_with_a_warning()
     capture = capture_of(poses_at(line(160)), split=given)
     found = proposals_of(capture)
     assert found["given"].near > 0.8
-    assert not found["given"].is_honest
+    assert not found["given"].is_leak_free
     assert found["given"].steps[1] == pytest.approx(1)
     for asked in ("auto", "given"):
         chosen = choose(list(found.values()), asked, capture)
@@ -152,8 +152,8 @@ def test_a_split_out_of_reach_is_told():
     capture = capture_of(poses_at(line(100)))
     split = np.array(["train"] * 20 + ["unused"] * 60 + ["test"] * 20)
     proposal = measured("block", "by hand", split, capture, motion_of(capture))
-    assert proposal.is_honest
-    assert not proposal.is_learnable
+    assert proposal.is_leak_free
+    assert not proposal.is_covered
     chosen = choose([proposal], "auto", capture)
     assert "asks much" in chosen.warning
     assert "none is both" in chosen.why
