@@ -72,7 +72,9 @@ def tree_of(path: Path) -> ast.Module:
 def strings(node: ast.AST) -> Iterator[tuple[int, str]]:
     """Line and text of string literals that are prose; an f-string is one text, without its fields."""
     if isinstance(node, ast.JoinedStr):
-        yield node.lineno, "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+        text = "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+        if " " in text.strip():
+            yield node.lineno, text
         for part in node.values:
             if isinstance(part, ast.FormattedValue):
                 yield from strings(part.value)

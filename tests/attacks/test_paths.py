@@ -81,7 +81,7 @@ def bundle_contract(folder, name):
     try:
         return verify_bundle(folder)
     except InputError as error:
-        path, opened, _ = str(error).partition(": is not the file")  # whose digest it was told
+        path, opened, _ = str(error).partition(": has another sha256")  # whose digest it was told
         if not opened:
             raise
         return [Path(path)]

@@ -314,7 +314,7 @@ def test_a_crop_that_can_fit_no_image_is_refused_before_reading(make):
         ({"scene": "heads"}, "mambaloc download 7scenes heads --root"),
         ({"scene": "haeds"}, "Did you mean heads?"),
         ({"dataset": "cambridge", "scene": "ShopFacade"}, "mambaloc download cambridge ShopFacade --root"),
-        ({"dataset": "8scenes"}, "data.dataset '8scenes': there is no such dataset. Did you mean 7scenes?"),
+        ({"dataset": "8scenes"}, "data.dataset '8scenes': no such dataset. Did you mean 7scenes?"),
         ({"val_sequences": ["seq-09"]}, "data.val_sequences: no seq-09 in the training split"),
         ({"keep_count": 21}, "data.keep_count 21: there are 20 training frames"),
         ({"keep_every": 0}, "data.keep_every 0: must be 1 or more"),

@@ -101,7 +101,7 @@ def test_a_port_that_cannot_be_had(folder):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
-        with pytest.raises(InputError, match=r"--port \d+: cannot be listened at .*; choose another"):
+        with pytest.raises(InputError, match=r"--port \d+: cannot be opened .*; choose another"):
             serve(folder, other.getsockname()[1])
     with pytest.raises(InputError, match="from 0 to 65535"):
         serve(folder, 70000)

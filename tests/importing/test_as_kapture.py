@@ -139,7 +139,7 @@ def test_wrong_uses_are_named_in_one_line_and_leave_nothing(scene, tmp_path):
         with pytest.raises(InputError, match=says):
             write_kapture(folder, out)
     edit_rows(scene, lambda _, row: row.update(split="unused"))
-    with pytest.raises(InputError, match="marks no frame for training, validation or testing"):
+    with pytest.raises(InputError, match="has no frame for training, validation or testing"):
         write_kapture(scene, tmp_path / "out")
     edit_rows(scene, lambda number, row: row.update(split="train", image=f"images/a,{number}.png"))
     with pytest.raises(InputError, match="has a comma in its path"):

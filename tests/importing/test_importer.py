@@ -231,7 +231,7 @@ def test_the_tool_says_what_it_found(rendered_once, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["{tmp}/nothing", "--out", "{tmp}/a"], "there is no such file or folder"),
+        (["{tmp}/nothing", "--out", "{tmp}/a"], "no such file or folder"),
         (["{room}", "--out", "{room}"], "already exists; remove it"),
         (["{room}", "--out", "{tmp}/a", "--format", "tango"], "unknown --format tango; choose one of"),
         (["{room}", "--out", "{tmp}/a", "--metres-per-unit", "0"], "--metres-per-unit 0.0: give a number"),

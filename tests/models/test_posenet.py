@@ -113,7 +113,7 @@ def test_a_warm_start_takes_the_networks_weights(learned):
 
 
 def test_a_warm_start_from_another_network_is_named(learned):
-    with pytest.raises(InputError, match=r"learned.ckpt: its network is another one .*size mismatch") as error:
+    with pytest.raises(InputError, match=r"learned.ckpt: has another network .*size mismatch") as error:
         mambaloc.create_model("posenet_geometric", **{**SMALL, "width": 16}, warm_start=str(learned[1]))
     assert "\n" not in str(error.value)
 

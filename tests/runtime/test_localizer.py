@@ -163,7 +163,7 @@ def test_what_is_no_model(model, tmp_path):
     plain = onnx.load(model)
     del plain.metadata_props[:]
     onnx.save(plain, tmp_path / "plain.onnx")
-    refused(tmp_path / "plain.onnx", "carries no contract")
+    refused(tmp_path / "plain.onnx", "has no contract")
     other = onnx.load(model)
     for change in ({"crop": (8, 8)}, {"in_model": True}):
         contract = Localizer(model).contract
@@ -328,7 +328,7 @@ def test_ctrl_c_writes_what_was_found(filtering, model, pictures, tmp_path, monk
 
 def test_where_poses_go_is_asked_before_the_work(model, tmp_path):
     for out in (tmp_path, tmp_path / "none/poses.tum"):
-        with pytest.raises(InputError, match=r"--out .*: there is no folder"):
+        with pytest.raises(InputError, match=r"--out .*: its folder does not exist"):
             localize_video(Localizer(model), "nothing at all", out)
 
 

@@ -245,9 +245,9 @@ def test_a_picture_that_ends_every_worker_is_given_up(bundles, frame, monkeypatc
         (["{den}", "--host", "0.0.0.0"], "--host 0.0.0.0: others may reach it, so a token is needed."),
         (["{den}", "--host", "0.0.0.0", "--token-file", "{short}"], "is not a token of 16 characters or more."),
         (["{den}", "--distorted"], "--distorted: den does not know the lens of its camera. Leave --distorted out."),
-        (["{den}", "{den}"], "is called den, as "),
+        (["{den}", "{den}"], "has the same name, den, as "),
         (["{den}", "--port", "70000"], "--port: 70000: give a whole number from 0 to 65535"),
-        (["{den}", "--host", "no.such.host.example", "--token-file", "{token}"], "cannot be listened at"),
+        (["{den}", "--host", "no.such.host.example", "--token-file", "{token}"], "cannot be opened"),
     ],
 )
 def test_wrong_uses_end_with_a_line(bundles, tmp_path, arguments, said):

@@ -215,7 +215,7 @@ def test_the_files_say_the_same(store, tmp_path):
     assert shown == table
     assert compared[1][:2] == ["a", "-0.200 (-0.200 to -0.200)"]
     assert compared[1][-2:] == ["2.00 (2.00 to 2.00)", "0.67 (0.67 to 0.67)"]
-    assert compared[2][1].endswith(", may be none)")
+    assert compared[2][1].endswith(", may be 0)")
     assert [line[0] for line in compared[1:]] == ["a", "b|<i>", "all"]
     assert times[1:3] == [
         ["a", "none", "30.0 ± 0.0", "120", "250 ± 0", "never"],

@@ -27,7 +27,7 @@ def test_a_sweep_is_planned(tool, tmp_path, capsys):
         (["benchmark", "latency", "student", "--repetitions", 3], "--repetitions 3: quartiles need 4"),
         (["benchmark", "latency", "studnt"], "studnt"),
         (["benchmark", "deployment", "none.ckpt"], "none.ckpt"),
-        (["benchmark", "speed", "--out", "nowhere/speed.json"], "there is no folder nowhere"),
+        (["benchmark", "speed", "--out", "nowhere/speed.json"], "the folder nowhere does not exist"),
         (["benchmark", "speed", "--overlay", "none.yaml"], "none.yaml"),
         (["sweep", "run", "none.yaml"], "none.yaml"),
         (["sweep", "report", "none"], "none: contains no result"),

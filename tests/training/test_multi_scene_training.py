@@ -128,7 +128,7 @@ def test_a_bundle_has_pictures_of_each_scene(run, tmp_path):
     ("command", "options", "message"),
     [
         (evaluate.main, ["--map", "map.safetensors"], "is of one scene, and this network knows several"),
-        (lambda words: visualize.main(["trajectory", *words]), [], "knows several scenes"),
+        (lambda words: visualize.main(["trajectory", *words]), [], "has several scenes"),
     ],
 )
 def test_what_takes_one_scene_says_so(run, command, options, message, capsys):

@@ -176,7 +176,8 @@ def test_an_error_leaves_no_file(pictures, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "says"), [("a.txt", "Give one that ends in .rrd"), ("nowhere/a.rrd", "there is no folder"), ("", ".rrd")]
+    ("name", "says"),
+    [("a.txt", "Give a file that ends in .rrd"), ("nowhere/a.rrd", "its folder does not exist"), ("", ".rrd")],
 )
 def test_wrong_names_are_told_in_a_line(tmp_path, name, says):
     with pytest.raises(InputError, match=says), rerun_recording(tmp_path / name, "den"):

@@ -41,5 +41,5 @@ def test_an_entry_point_that_gives_no_dataset_is_refused(package, den):
 
 
 def test_a_near_miss_names_it(package, den):
-    with pytest.raises(InputError, match=r"there is no such dataset. Did you mean halls\?"):
+    with pytest.raises(InputError, match=r"no such dataset. Did you mean halls\?"):
         PoseDataModule("hals", str(den), "den").setup("fit")

@@ -190,7 +190,7 @@ def test_a_row_of_no_pose_is_nan(source, walk):
         ("odometry.csv", HEADER + "\n1, 0, 0, 0\n", "line 2: is not a row timestamp, frame"),
         ("odometry.csv", HEADER + "\n1, 0, 0, 0, 0, x, 0, 0, 1\n", "line 2: is not a row timestamp, frame"),
         ("odometry.csv", HEADER + "\nnan, 0, 0, 0, 0, 0, 0, 0, 1\n", "line 2: is not a row timestamp, frame"),
-        ("odometry.csv", HEADER + "\n1, 0.5, 0, 0, 0, 0, 0, 0, 1\n", "line 2: 0.5 is not a number of a frame"),
+        ("odometry.csv", HEADER + "\n1, 0.5, 0, 0, 0, 0, 0, 0, 1\n", "line 2: 0.5 is not a frame's number"),
         ("odometry.csv", HEADER + "\n1, 900, 0, 0, 0, 0, 0, 0, 1\n", "no pose of a frame that was chosen"),
         ("odometry.csv", HEADER + "\n1, 0, 0, 0, 0, 9, 0, 0, 1\n", "far from unit length"),
         ("camera_matrix.csv", "1, 2\n3, 4\n", "is not a 3x3 matrix"),

@@ -192,7 +192,7 @@ def test_two_trajectories_are_ambiguous(recording, tmp_path, refused):
 
 def test_a_trajectory_without_images(recording, tmp_path, refused):
     (tmp_path / "poses.tum").write_text(trajectory(recording, list("012345")))
-    refused(read_tum, tmp_path, "none holds an image")
+    refused(read_tum, tmp_path, "no folder contains an image")
 
 
 def test_orb_slam3_writes_nanoseconds_as_doubles(recording, tmp_path):

@@ -232,7 +232,7 @@ def test_the_process_holds_no_opencv():
 
 def test_a_model_is_read_with_opencv_loaded_first():
     """Our own process reads models by pycolmap: OpenCV, which then finds its own zlib, is there before."""
-    pytest.importorskip("pycolmap", reason="models are read by pycolmap, the extra [colmap]")
+    pytest.importorskip("pycolmap", reason="needs pycolmap, the extra [colmap]")
     code = (
         "import sys; from pathlib import Path; from mambaloc.data.colmap import import_pycolmap;"
         "assert 'cv2' in sys.modules; import_pycolmap(Path('a'));"
@@ -246,7 +246,7 @@ def test_what_is_no_film(tmp_path, refused):
     pytest.importorskip("pycolmap", reason="structure from motion is pycolmap's, the extra [colmap]")
     (tmp_path / "a.mp4").write_bytes(b"no video")
     refused(read_structure, tmp_path / "a.mp4", "cannot be opened")
-    refused(read_structure, tmp_path / "none", "none holds an image")
+    refused(read_structure, tmp_path / "none", "no folder contains an image")
 
 
 def test_without_pycolmap_the_extra_is_named(tmp_path, refused, monkeypatch):
