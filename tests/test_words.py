@@ -57,7 +57,7 @@ OLD_SPELLINGS = {
 
 def findings(text: str) -> list[str]:
     """Each word of the list in a text, with what to write instead."""
-    prose = CODE.sub("", text)
+    prose = " ".join(CODE.sub("", text).split())  # phrases go on over the ends of lines
     if not ANY.search(prose):
         return []
     return [f"{found[0]!r}: write {INSTEAD[word]}" for word, rule in WORDS.items() for found in rule.finditer(prose)]

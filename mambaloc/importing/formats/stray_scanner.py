@@ -2,7 +2,7 @@
 
 ``odometry.csv`` has a header and a row a frame, ``timestamp, frame, x, y, z, qx, qy, qz, qw`` in seconds and metres,
 and in newer versions ``fx, fy, cx, cy``. ``camera_matrix.csv`` is K, 3x3, of the video's frames. ``rgb.mp4`` is the
-film, ``depth/NNNNNN.png`` a frame's depth in millimetres of 16 bits, with the same field of view, and
+video, ``depth/NNNNNN.png`` a frame's depth in millimetres of 16 bits, with the same field of view, and
 ``confidence/NNNNNN.png`` how sure ARKit is of each of its pixels: 0, 1 or 2. Source:
 ``docs/format.md`` of github.com/strayrobots/scanner. The app turns ARKit's camera axes to OpenCV's before it writes a
 quaternion, which the format does not say: ``OdometryEncoder.swift`` there, and its author's answer in issue 11. The

@@ -20,8 +20,8 @@ LEAST_PROBABILITY = 0.95
 MOST_DEVIATION = 0.12
 """The largest :attr:`Evidence.deviation` of an accepted pose: 8 cm in a room where key frames spread over 0.66 m."""
 CALIBRATION = {"frames": 224, "pictures": 3222, "accepted": 0.677, "accepted_and_wrong": 0.0009}
-"""How that was measured: frames held out of training, of a real room and a rendered one, each in two maps; images of
-them, disturbed, that gave a pose; the share that is accepted, with 20 inliers, by coefficients that were fitted to
+"""How that was measured: frames held out of training, of a real room and a rendered one, each in two maps; disturbed
+images that gave a pose; the share that is accepted, with 20 inliers, by coefficients that were fitted to
 other sequences; and of these the wrong ones' (95 %: 0.03 to 0.33 %)."""
 
 _CELLS = 4  # a side of the grid
