@@ -65,7 +65,11 @@ def main() -> None:
     )
     maps.add_argument("--no-map", dest="sparse_map", action="store_false", help="let the network answer alone")
     parser.add_argument("--topic", metavar="NAME", help="of a bag's pictures, where it has several")
-    parser.add_argument("--world-frame", metavar="FRAME", help="that a bag's poses are in; map unless given")
+    parser.add_argument(
+        "--world-frame",
+        metavar="FRAME",
+        help="that a bag's poses are in; unless given, map, or the scene of a network that knows several",
+    )
     parser.add_argument("--pose-frame", metavar="FRAME", help="that a bag's poses are of; the camera's unless given")
     parser.add_argument(
         "--rerun", type=Path, metavar="FILE.rrd", help="also record frames and poses for Rerun's viewer"
@@ -79,7 +83,8 @@ def main() -> None:
         if is_bag(Path(args.source)):
             said = _localise_bag(localiser, args, recording)
         else:
-            said = f"{args.out}: {_localise_frames(localiser, args, recording)}"
+            done = _localise_frames(localiser, args, recording)
+            said = f"{', '.join(map(str, done.files))}: {done}"
     print(said)
     if args.rerun is not None:
         print(f"{args.rerun}: open it with rerun {args.rerun}")
@@ -141,7 +146,7 @@ def _localise_bag(localiser: Localiser, args: Namespace, recording: RerunRecordi
         straightener,
         args.topic,
         args.intrinsics,
-        args.world_frame or "map",
+        args.world_frame,
         args.pose_frame,
         on_picture=None if recording is None else record,
     )

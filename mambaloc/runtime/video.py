@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,8 @@ from mambaloc.runtime.pose_filter import PoseFilter, smooth
 from mambaloc.runtime.sources import SourceFrame, frames_of
 from mambaloc.runtime.trajectory import write_tum
 
+_NO_NAME = re.compile(r"[^\w.-]")  # in a scene's name: what no file's may have
+
 FILTERS = ("causal", "smooth")
 """How a video's poses may be filtered: each from those until then, or from all."""
 
@@ -28,7 +32,7 @@ class Followed:
     """What became of a source's frames.
 
     Args:
-        scene: the place.
+        scene: the place; of a network that knows several, each that was recognised and how often.
         count: frames that were localised.
         lost: frames without a pose, as a map alone may leave.
         from_map: of the poses, those that the map found; None unless it stands beside a network.
@@ -36,6 +40,7 @@ class Followed:
         latency_ms: median of a frame.
         unfamiliar: of the frames, those that do not look like the place; none where that cannot be said.
         radii: medians of what nine of ten poses are within, in metres and degrees, where that can be said.
+        files: the trajectories that were written.
     """
 
     scene: str
@@ -46,6 +51,7 @@ class Followed:
     latency_ms: float
     unfamiliar: int = 0
     radii: tuple[float, float] | None = None
+    files: tuple[Path, ...] = ()
 
     def __str__(self) -> str:
         """As a tool prints it: one line, and another where it can be said how far off poses are."""
@@ -76,7 +82,9 @@ def follow(
     """Localise every frame of a source with a progress bar on stderr, and write a TUM trajectory.
 
     Ctrl-C ends it; what was found is written then, and also where a frame cannot be localised. The trajectory's times
-    are those that the filter takes: seconds since the first frame. It leaves out frames without a pose.
+    are those that the filter takes: seconds since the first frame. It leaves out frames without a pose. A network that
+    knows several scenes answers in the frame of the one that it recognises, so each gets a trajectory of its own,
+    ``poses_SCENE.tum`` where ``out`` is ``poses.tum``.
 
     Args:
         localiser: of the model.
@@ -98,6 +106,7 @@ def follow(
     console = Console(stderr=True)
     found: list[tuple[float, Localisation]] = []
     kept: list[tuple[float, Localisation]] = []
+    files: list[Path] = []
     outliers = None
     try:
         watched = track(frames, "Localising", count, console=console, transient=True)
@@ -111,15 +120,30 @@ def follow(
     finally:
         kept = [each for each in found if each[1].source is not None]
         if kept:
-            times_s, poses = zip(*kept, strict=True)
             with console.status("Filtering"):
-                positions_m, quaternions, outliers = _filtered(filtering, times_s, poses)
-            write_tum(out, times_s, positions_m, quaternions)
+                files, outliers = _write_trajectories(out, kept, filtering)
     if not found:
         raise InputError(f"{source}: holds no frame; give another video")
     if not kept:
         raise InputError(f"{source}: none of its {len(found)} frames was localised. Give frames of the map's place.")
-    return summarise(localiser, [pose for _, pose in found], outliers)
+    return replace(summarise(localiser, [pose for _, pose in found], outliers), files=tuple(files))
+
+
+def _write_trajectories(
+    out: Path, found: Sequence[tuple[float, Localisation]], filtering: str | None
+) -> tuple[list[Path], int | None]:
+    """Write a trajectory for each scene that was recognised; return them, and how many poses a filter left out."""
+    by_scene: dict[str | None, list[tuple[float, Localisation]]] = {}
+    for each in found:
+        by_scene.setdefault(each[1].scene, []).append(each)
+    files, outliers = [], 0
+    for scene, answers in by_scene.items():
+        times_s, poses = zip(*answers, strict=True)
+        positions_m, quaternions, left_out = _filtered(filtering, times_s, poses)
+        outliers += left_out
+        files.append(out if scene is None else out.with_stem(f"{out.stem}_{_NO_NAME.sub('_', scene)}"))
+        write_tum(files[-1], times_s, positions_m, quaternions)
+    return files, None if filtering is None else outliers
 
 
 def summarise(localiser: Localiser, found: Sequence[Localisation], outliers: int | None = None) -> Followed:
@@ -132,8 +156,9 @@ def summarise(localiser: Localiser, found: Sequence[Localisation], outliers: int
     """
     poses = [pose for pose in found if pose.source is not None]
     has_both = localiser.contract is not None and localiser.sparse_map is not None
+    recognised = Counter(pose.scene for pose in poses if pose.scene is not None)
     return Followed(
-        localiser.scene,
+        ", ".join(f"{scene} ({count})" for scene, count in recognised.most_common()) or localiser.scene,
         len(poses),
         len(found) - len(poses),
         sum(pose.source == "map" for pose in poses) if has_both else None,
@@ -151,11 +176,11 @@ def _median_radii(poses: Sequence[Localisation]) -> tuple[float, float] | None:
 
 def _filtered(
     filtering: str | None, times_s: Sequence[float], poses: Sequence[Localisation]
-) -> tuple[NDArray[np.floating], NDArray[np.floating], int | None]:
+) -> tuple[NDArray[np.floating], NDArray[np.floating], int]:
     """Positions (N, 3), quaternions (N, 4), and how many were left out, by a filter."""
     positions_m, quaternions = (np.stack([getattr(pose, of) for pose in poses]) for of in ("position_m", "quaternion"))
     if filtering is None:
-        return positions_m, quaternions, None
+        return positions_m, quaternions, 0
     if filtering == "smooth":
         estimates = smooth(times_s, positions_m, quaternions)
     else:
