@@ -4,6 +4,7 @@ What costs seconds is made once a session, by whichever worker needs it first, a
 file copies the folder to its own ``tmp_path``.
 """
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 from hypothesis import settings
-from tiny import TINY_BACKBONE, TINY_MAMBALOC, write_recipe
+from tiny import LAB_OFFSET_M, TINY_BACKBONE, TINY_MAMBALOC, TWO_SCENES, write_recipe
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # each worker a core of its own; read when torch is imported
@@ -64,6 +65,25 @@ def scenes(made_once):
         write_7scenes(root, "heads", frames_of_sequences(sequences, {3}), size=(96, 72), depth=True)
 
     return made_once("scenes", render)
+
+
+@pytest.fixture(scope="session")
+def heads_and_lab(made_once, scenes):
+    """A root with ``heads``, and ``lab``: another room, whose frame lies far from its world's origin."""
+    from mambaloc.rendering.scenes.layouts import write_7scenes
+    from mambaloc.rendering.scenes.shots import frames_of_sequences
+    from mambaloc.rendering.trajectories import smooth_trajectory
+
+    def render(root: Path) -> None:
+        shutil.copytree(scenes / "heads", root / "heads")
+        inside_m = ((-2.0, -2.0, 1.2), (2.0, 2.0, 1.6))
+        sequences = {n: smooth_trajectory(6 if n == 3 else 12, seed=n + 10, inside_m=inside_m) for n in (1, 2, 3)}
+        lab = write_7scenes(root, "lab", frames_of_sequences(sequences, {3}), size=(96, 72), seed=5)
+        note = json.loads((lab / "scene.json").read_text())
+        world = {"offset_m": LAB_OFFSET_M, "metres_per_unit": 1.0}
+        (lab / "scene.json").write_text(json.dumps({**note, "world": world}))
+
+    return made_once("heads_and_lab", render)
 
 
 @pytest.fixture(scope="session")
@@ -140,6 +160,35 @@ def trained_with_map(made_once, den):
         main([str(recipe), *options, "--trainer.default_root_dir", str(folder / "run")])
 
     return made_once("trained_with_map", train) / "run"
+
+
+@pytest.fixture(scope="session")
+def trained_on_two(made_once, heads_and_lab):
+    """The folder of a tiny DenseLoc's run of 30 epochs on two scenes."""
+    from mambaloc.cli import main
+
+    def train(folder: Path) -> None:
+        sizes = {"backbone": TINY_BACKBONE, "dim": 16, "heads": 2, "encoder_layers": 1, "feedforward": 16}
+        model = {"class_path": "LitDenseLoc", "init_args": {**sizes, "lr": 0.003, "normalise_position": True}}
+        data = {"scenes": TWO_SCENES, "batch_size": 8, "validation": "block", "val_gap": 1, "val_fraction": 0.4}
+        data |= {"brightness": 0.0, "contrast": 0.0, "saturation": 0.0}  # colours tell the two rooms apart
+        recipe = write_recipe(folder / "recipe.yaml", heads_and_lab, model, data, max_epochs=30)
+        main([str(recipe), "--onnx_export.enabled", "true", "--trainer.default_root_dir", str(folder / "run")])
+
+    return made_once("trained_on_two", train) / "run"
+
+
+@pytest.fixture(scope="session")
+def bundle_of_two(made_once, trained_on_two):
+    """A bundle of a network that knows two scenes: float32 and float16 models that take images as they are."""
+    from mambaloc.export import write_bundle
+    from mambaloc.models import Checkpoint
+
+    def export(folder: Path) -> None:
+        checkpoint = Checkpoint.read(trained_on_two / "checkpoints/best.ckpt")
+        write_bundle(checkpoint.system(), checkpoint.data(), folder / "bundle", ("onnx", "fp16"), "web")
+
+    return made_once("bundle_of_two", export) / "bundle"
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,10 @@ TINY_MAMBALOC = {
     "lr": 0.001, "lr_step_epochs": 2, "normalise_position": True,
 }  # fmt: skip
 
+TWO_SCENES = ["heads", "lab"]
+LAB_OFFSET_M = (500_000.0, 4_000_000.0, 30.0)
+"""Where the lab's frame lies in its world."""
+
 
 def write_recipe(path: Path, scenes: Path, model: dict, data: dict, **trainer) -> Path:
     """Write a recipe that trains a system on ``scenes``."""

@@ -35,7 +35,7 @@ def localize_bag(
     straightener: Straightener,
     topic: str | None = None,
     intrinsics: ArrayLike | None = None,
-    world: str = "map",
+    world: str | None = None,
     frame: str | None = None,
     on_picture: Callable[[BagImage, Image, ArrayLike | None, Localization], None] | None = None,
 ) -> Followed:
@@ -51,7 +51,8 @@ def localize_bag(
         straightener: removes the distortion that the bag's ``CameraInfo`` has.
         topic: of the images; the only one unless given.
         intrinsics: of every image, (3, 3) in pixels; those of ``CameraInfo`` unless given.
-        world: the name of the scene's frame in messages.
+        world: the name of the scene's frame in messages; unless given, ``map``, or the name of the recognised scene if
+            the network knows several.
         frame: whose poses to write, through the bag's transforms; the camera's optical frame unless given.
         on_picture: is given each image, it without distortion, its intrinsics, and what was found of it.
 
@@ -60,7 +61,7 @@ def localize_bag(
     """
     found: list[Localization] = []
     left_out, written = Counter[str](), 0
-    with open_bag(source) as bag, pose_bag(out, world) as write:
+    with open_bag(source) as bag, pose_bag(out) as write:
         topic = image_topic(bag, topic)
         body_of = _body_of(bag, frame)
         pictures = _straight(bag, topic, straightener, intrinsics, left_out)
@@ -76,7 +77,7 @@ def localize_bag(
                 if isinstance(stated, str):
                     left_out[stated] += 1
                 else:
-                    write(picture.ns, *stated)
+                    write(picture.ns, world or found[-1].scene or "map", *stated)
                     written += 1
         except KeyboardInterrupt:
             pass

@@ -18,20 +18,22 @@ from mambaloc.runtime.maps.radii import covariance_radius
 from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix
 
 Matrix = NDArray[np.float64]
-WritePose = Callable[[int, Matrix, Matrix, Matrix], None]
+WritePose = Callable[[int, str, Matrix, Matrix, Matrix], None]
 
 TOPIC = "/mambaloc/pose"
 _TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
 @contextmanager
-def pose_bag(out: Path, world: str) -> Iterator[WritePose]:
-    """Make a bag, and give what writes a pose to it: time in nanoseconds, position, quaternion wxyz, covariance (6, 6).
+def pose_bag(out: Path) -> Iterator[WritePose]:
+    """Make a bag, and give what writes a pose to it.
+
+    That takes the time in nanoseconds, the name of the frame that the pose is in, position, quaternion wxyz and
+    covariance (6, 6).
 
     Args:
         out: a ROS 1 bag where its name ends in ``.bag``, or the folder of a ROS 2 bag in MCAP. It is there whole once
             the block ends; an error leaves nothing.
-        world: the frame that poses are in.
 
     Raises:
         InputError: without rosbags, or where it is there already or cannot be written.
@@ -47,7 +49,7 @@ def pose_bag(out: Path, world: str) -> Iterator[WritePose]:
     with writing(out), _ros1_bag(out) if is_1 else _ros2_bag(out) as bag:
         connection = bag.add_connection(TOPIC, _TYPE, typestore=types)
 
-        def write(ns: int, position: Matrix, quaternion: Matrix, covariance: Matrix) -> None:
+        def write(ns: int, world: str, position: Matrix, quaternion: Matrix, covariance: Matrix) -> None:
             message = _message(types, world, ns, position, quaternion, covariance)
             bag.write(connection, ns, serialize(message, _TYPE))
 

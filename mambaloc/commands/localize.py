@@ -71,7 +71,11 @@ def main() -> None:
     )
     maps.add_argument("--no-map", dest="sparse_map", action="store_false", help="use the network alone")
     parser.add_argument("--topic", metavar="NAME", help="topic of a bag's images, if it has several")
-    parser.add_argument("--world-frame", metavar="FRAME", help="frame that a bag's poses are in (default: map)")
+    parser.add_argument(
+        "--world-frame",
+        metavar="FRAME",
+        help="frame that a bag's poses are in (default: map; the scene, of a network that knows several)",
+    )
     parser.add_argument("--pose-frame", metavar="FRAME", help="frame that a bag's poses are of (default: the camera's)")
     parser.add_argument(
         "--rerun", type=Path, metavar="FILE.rrd", help="also record frames and poses for Rerun's viewer"
@@ -85,7 +89,8 @@ def main() -> None:
         if is_bag(Path(args.source)):
             said = _localize_bag(localizer, args, recording)
         else:
-            said = f"{args.out}: {_localize_frames(localizer, args, recording)}"
+            done = _localize_frames(localizer, args, recording)
+            said = f"{', '.join(map(str, done.files))}: {done}"
     print(said)
     if args.rerun is not None:
         print(f"{args.rerun}: open it with rerun {args.rerun}")
@@ -149,7 +154,7 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
         straightener,
         args.topic,
         args.intrinsics,
-        args.world_frame or "map",
+        args.world_frame,
         args.pose_frame,
         on_picture=None if recording is None else record,
     )

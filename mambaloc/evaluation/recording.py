@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.errors import InputError
@@ -59,4 +62,5 @@ def _network(trained: Trained, table: PoseErrorTable) -> list[Localization]:
     stated = uncertainty_of_test(trained.system, trained.data)
     radii = itertools.repeat((None, None, None)) if stated is None else stated.by_frame()
     poses = zip(table.predicted_position_m.cpu().numpy(), table.predicted_quaternion.cpu().numpy(), strict=True)
-    return [Localization(*pose, 0.0, *three) for pose, three in zip(poses, radii, strict=False)]
+    answers = [Localization(*pose, 0.0, *three) for pose, three in zip(poses, radii, strict=False)]
+    return [each if np.isfinite(each.position_m).all() else replace(each, source=None) for each in answers]

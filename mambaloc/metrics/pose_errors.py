@@ -32,7 +32,7 @@ class PoseErrorTable:
 
     Shape:
         ``index``, ``position_error_m`` and ``rotation_error_deg`` (N,); positions (N, 3) in metres; quaternions
-        (N, 4), canonical. Errors are infinite where no pose was found.
+        (N, 4), canonical. Where no pose was found, it is NaN and its errors are infinite.
     """
 
     index: Tensor
@@ -68,7 +68,8 @@ class PoseErrorTable:
 class PoseErrors(Metric):
     """Collect every frame's prediction; correct under DDP, where a median of medians would not be.
 
-    Frames that a distributed sampler repeats are counted once. Errors of a pose in another scene's frame are infinite.
+    Frames that a distributed sampler repeats are counted once. A frame that is taken for another scene's has no pose in
+    this one's frame: NaN, and infinite errors.
     """
 
     full_state_update = False
@@ -118,8 +119,10 @@ class PoseErrors(Metric):
         first = torch.full((int(order.max()) + 1,), len(index), device=index.device)
         first = first.scatter_reduce(0, order, torch.arange(len(index), device=index.device), "amin")
         poses = (self.predicted_position_m, self.predicted_quaternion, self.true_position_m, self.true_quaternion)
-        table = PoseErrorTable.of(index[first], *(dim_zero_cat(state)[first] for state in poses))
+        predicted_m, predicted, true_m, true = (dim_zero_cat(state)[first] for state in poses)
         is_recognized = dim_zero_cat(self.is_recognized)[first]
+        predicted_m, predicted = (torch.where(is_recognized[:, None], p, torch.nan) for p in (predicted_m, predicted))
+        table = PoseErrorTable.of(index[first], predicted_m, predicted, true_m, true)
         position_m, rotation_deg = (
             torch.where(is_recognized, errors, torch.inf)
             for errors in (table.position_error_m, table.rotation_error_deg)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,20 +127,41 @@ class Localizer:
                 another shape without intrinsics; for a distorted image with intrinsics, without a known lens, or of
                 another shape than the lens's.
         """
-        rgb = read_image(image) if isinstance(image, str | Path) else as_rgb(image)
+        return next(self.localize_batch([image], [intrinsics], is_distorted))
+
+    def localize_batch(
+        self,
+        images: Sequence[str | Path | Image],
+        intrinsics: Sequence[ArrayLike | None] | None = None,
+        is_distorted: bool = False,
+    ) -> Iterator[Localization]:
+        """Localize images that came together: a network that takes no raw input runs once for all of them.
+
+        Args:
+            images: N images, each as :meth:`localize` takes it.
+            intrinsics: of each, or None.
+            is_distorted: of all.
+
+        Yields:
+            The pose of each, in their order. The latency is an equal share of the network's and its own in the map.
+
+        Raises:
+            InputError: as :meth:`localize`, if any image cannot be localized: none is, then.
+        """
         start = time.perf_counter()
+        matrices = list(intrinsics) if intrinsics is not None else [None] * len(images)
+        rgb = [read_image(each) if isinstance(each, str | Path) else as_rgb(each) for each in images]
         if is_distorted:
-            if intrinsics is not None:
+            if any(matrix is not None for matrix in matrices):
                 raise InputError("intrinsics: distorted images have those of their lens. Leave out one.")
-            rgb, intrinsics = self.undistortion.apply(rgb, str(self._path))
-        network = None if self._network is None else self._network.localize(rgb, intrinsics)
-        in_map = self._localize_in_map(rgb, intrinsics, network)
-        if in_map is not None:
-            _warn_of_focal_length(in_map)
-        answer = network if in_map is None else combined(network, in_map)
-        assert answer is not None  # one of the two is there
-        position_m = self.world_of(answer).position_m(answer.position_m)
-        return replace(answer, position_m=position_m, latency_s=time.perf_counter() - start)
+            pinholes = [self.undistortion.apply(each, str(self._path)) for each in rgb]
+            rgb, matrices = [image for image, _ in pinholes], [matrix for _, matrix in pinholes]
+        network = [None] * len(rgb) if self._network is None else self._network.localize(rgb, matrices)
+        shared_s = (time.perf_counter() - start) / len(rgb)
+        for image, matrix, pose in zip(rgb, matrices, network, strict=True):
+            start = time.perf_counter()
+            answer = self._with_map(image, matrix, pose)
+            yield replace(answer, latency_s=shared_s + time.perf_counter() - start)
 
     def localize_each(
         self,
@@ -178,6 +199,15 @@ class Localizer:
         """Localize a source's frames. Deprecated: removed in the next release."""
         return self.localize_each(source, intrinsics, is_distorted)
 
+    def _with_map(self, rgb: Image, intrinsics: ArrayLike | None, network: Localization | None) -> Localization:
+        """The network's answer or the map's, in the world of the data that the scene was made of."""
+        in_map = self._localize_in_map(rgb, intrinsics, network)
+        if in_map is not None:
+            _warn_of_focal_length(in_map)
+        answer = network if in_map is None else combined(network, in_map)
+        assert answer is not None  # one of the two is there
+        return replace(answer, position_m=self.world_of(answer).position_m(answer.position_m))
+
     def _localize_in_map(
         self, rgb: Image, intrinsics: ArrayLike | None, network: Localization | None
     ) -> MapLocalization | None:
@@ -189,7 +219,7 @@ class Localizer:
         try:
             return self._map.localize(rgb, intrinsics, prior)
         except InputError as error:
-            warnings.warn(f"{error} The network answers without the map.", InputWarning, stacklevel=3)
+            warnings.warn(f"{error} The network answers without the map.", InputWarning, stacklevel=5)
             return None
 
 
@@ -203,7 +233,7 @@ def _warn_of_focal_length(found: MapLocalization) -> None:
         f"intrinsics: the map's matches show that the focal length is {off}, so its poses are not accepted. "
         "Give the intrinsics of these images.",
         InputWarning,
-        stacklevel=3,
+        stacklevel=5,  # what called Localizer.localize
     )
 
 

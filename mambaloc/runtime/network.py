@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,27 +47,39 @@ class Network:
         self.contract = Contract.from_json(metadata[METADATA_KEY], str(self.path))
         self._check_input()
 
-    def localize(self, rgb: Image, intrinsics: ArrayLike | None = None) -> Localization:
-        """Localize an RGB image (H, W, 3), ``uint8``.
+    def localize(
+        self, images: Sequence[Image], intrinsics: Sequence[ArrayLike | None] | None = None
+    ) -> list[Localization]:
+        """Localize RGB images (H, W, 3), ``uint8``: together, or one after another if the model takes raw input.
 
         Args:
-            rgb: the image.
-            intrinsics: (3, 3) pinhole matrix in its pixels, which a model that takes none leaves unread; the training
-                camera's unless given.
+            images: N images, of any sizes.
+            intrinsics: (3, 3) pinhole matrix in the pixels of each, which a model that takes none leaves unread; the
+                training camera's where None.
+
+        Returns:
+            N poses. The latency of each is that of the batch, divided by its size.
 
         Raises:
             InputError: for intrinsics that cannot be the image's; and, without them, for an image that does not hold
                 the crop that the network takes.
         """
+        if self.contract.intrinsics is None or intrinsics is None:
+            intrinsics = [None] * len(images)
         start = time.perf_counter()
-        said = self._session.run(None, self._feeds(rgb, None if self.contract.intrinsics is None else intrinsics))
-        taken_s, found = (
-            time.perf_counter() - start,
-            dict(zip(self.contract.outputs, (each[0] for each in said), strict=True)),
-        )
+        feeds = [self._feeds(rgb, matrix) for rgb, matrix in zip(images, intrinsics, strict=True)]
+        if self.contract.preprocessing.in_model:
+            outputs = [self._session.run(None, feed) for feed in feeds]
+        else:
+            outputs = [self._session.run(None, {name: np.concatenate([f[name] for f in feeds]) for name in feeds[0]})]
+        latency_s = (time.perf_counter() - start) / len(images)
+        rows = (row for batch in outputs for row in zip(*batch, strict=True))
+        return [self._localization(dict(zip(self.contract.outputs, row, strict=True)), latency_s) for row in rows]
+
+    def _localization(self, found: dict[str, NDArray[np.generic]], latency_s: float) -> Localization:
         radius_m, radius_deg, unfamiliarity = (float(found[name]) if name in found else None for name in UNCERTAINTY)
         answer = Localization(
-            found["position_m"], found["quaternion_wxyz"], taken_s, radius_m, radius_deg, unfamiliarity
+            found["position_m"], found["quaternion_wxyz"], latency_s, radius_m, radius_deg, unfamiliarity
         )
         if not self.contract.scenes:
             return answer

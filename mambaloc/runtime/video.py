@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,8 @@ from mambaloc.runtime.pose_filter import PoseFilter, smooth
 from mambaloc.runtime.sources import SourceFrame, frames_of
 from mambaloc.runtime.trajectory import write_tum
 
+_NO_NAME = re.compile(r"[^\w.-]")  # in a scene's name: what no file's may have
+
 FILTERS = ("causal", "smooth")
 """How a video's poses may be filtered: each from those until then, or from all."""
 
@@ -28,7 +32,7 @@ class VideoResult:
     """What became of a source's frames.
 
     Args:
-        scene: the place.
+        scene: the place; of a network that knows several, each that was recognised and how often.
         count: frames that were localized.
         lost: frames without a pose, as a map alone may leave.
         from_map: of the poses, those that the map found; None unless it stands beside a network.
@@ -36,6 +40,7 @@ class VideoResult:
         latency_ms: median of a frame.
         unfamiliar: of the frames, those that do not look like the place; None if the model does not estimate it.
         radii: medians of what nine of ten poses are within, in metres and degrees; None if unknown.
+        files: the trajectories that were written.
     """
 
     scene: str
@@ -46,6 +51,7 @@ class VideoResult:
     latency_ms: float
     unfamiliar: int = 0
     radii: tuple[float, float] | None = None
+    files: tuple[Path, ...] = ()
 
     def __str__(self) -> str:
         """Format for a terminal: one line, and another with the uncertainty of poses where it is known."""
@@ -76,7 +82,9 @@ def localize_video(
     """Localize every frame of a source with a progress bar on stderr, and write a TUM trajectory.
 
     Ctrl-C ends it; what was found is written then, and also where a frame cannot be localized. The trajectory's times
-    are those that the filter takes: seconds since the first frame. It leaves out frames without a pose.
+    are those that the filter takes: seconds since the first frame. It leaves out frames without a pose. A network that
+    knows several scenes answers in the frame of the one that it recognises, so each gets a trajectory of its own,
+    ``poses_SCENE.tum`` where ``out`` is ``poses.tum``.
 
     Args:
         localizer: of the model.
@@ -98,6 +106,7 @@ def localize_video(
     console = Console(stderr=True)
     found: list[tuple[float, Localization]] = []
     kept: list[tuple[float, Localization]] = []
+    files: list[Path] = []
     outliers = None
     try:
         watched = track(frames, "Localizing", count, console=console, transient=True)
@@ -111,15 +120,30 @@ def localize_video(
     finally:
         kept = [each for each in found if each[1].source is not None]
         if kept:
-            times_s, poses = zip(*kept, strict=True)
             with console.status("Filtering"):
-                positions_m, quaternions, outliers = _filtered(filtering, times_s, poses)
-            write_tum(out, times_s, positions_m, quaternions)
+                files, outliers = _write_trajectories(out, kept, filtering)
     if not found:
         raise InputError(f"{source}: has no frame; give another video")
     if not kept:
         raise InputError(f"{source}: none of its {len(found)} frames was localized. Give frames of the map's place.")
-    return summarize(localizer, [pose for _, pose in found], outliers)
+    return replace(summarize(localizer, [pose for _, pose in found], outliers), files=tuple(files))
+
+
+def _write_trajectories(
+    out: Path, found: Sequence[tuple[float, Localization]], filtering: str | None
+) -> tuple[list[Path], int | None]:
+    """Write a trajectory for each scene that was recognised; return them, and how many poses a filter left out."""
+    by_scene: dict[str | None, list[tuple[float, Localization]]] = {}
+    for each in found:
+        by_scene.setdefault(each[1].scene, []).append(each)
+    files, outliers = [], 0
+    for scene, answers in by_scene.items():
+        times_s, poses = zip(*answers, strict=True)
+        positions_m, quaternions, left_out = _filtered(filtering, times_s, poses)
+        outliers += left_out
+        files.append(out if scene is None else out.with_stem(f"{out.stem}_{_NO_NAME.sub('_', scene)}"))
+        write_tum(files[-1], times_s, positions_m, quaternions)
+    return files, None if filtering is None else outliers
 
 
 def summarize(localizer: Localizer, found: Sequence[Localization], outliers: int | None = None) -> VideoResult:
@@ -132,8 +156,9 @@ def summarize(localizer: Localizer, found: Sequence[Localization], outliers: int
     """
     poses = [pose for pose in found if pose.source is not None]
     has_both = localizer.contract is not None and localizer.sparse_map is not None
+    recognized = Counter(pose.scene for pose in poses if pose.scene is not None)
     return VideoResult(
-        localizer.scene,
+        ", ".join(f"{scene} ({count})" for scene, count in recognized.most_common()) or localizer.scene,
         len(poses),
         len(found) - len(poses),
         sum(pose.source == "map" for pose in poses) if has_both else None,
@@ -151,11 +176,11 @@ def _median_radii(poses: Sequence[Localization]) -> tuple[float, float] | None:
 
 def _filtered(
     filtering: str | None, times_s: Sequence[float], poses: Sequence[Localization]
-) -> tuple[NDArray[np.floating], NDArray[np.floating], int | None]:
+) -> tuple[NDArray[np.floating], NDArray[np.floating], int]:
     """Positions (N, 3), quaternions (N, 4), and how many were left out, by a filter."""
     positions_m, quaternions = (np.stack([getattr(pose, of) for pose in poses]) for of in ("position_m", "quaternion"))
     if filtering is None:
-        return positions_m, quaternions, None
+        return positions_m, quaternions, 0
     if filtering == "smooth":
         estimates = smooth(times_s, positions_m, quaternions)
     else:

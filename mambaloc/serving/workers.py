@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import warnings
+from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -28,6 +29,7 @@ from mambaloc.runtime import Localizer
 from mambaloc.runtime.localization import Localization
 
 _TRIES = 3
+_MOST_TOGETHER = 4  # images; with more, an image takes no less time
 _START_S = 120.0
 _ENVIRONMENT = {  # of a worker: it has a core, and the memory of images that cameras take
     "OMP_NUM_THREADS": "1",
@@ -61,13 +63,37 @@ class WorkerLostError(Exception):
     """A worker died, or took too long, with a task in hand."""
 
 
+@dataclass(eq=False)
+class _Waiting:
+    """A task, its answer to come, and how many workers were lost with it."""
+
+    task: Task
+    answer: asyncio.Future[Answer]
+    lost: int = 0
+
+
+def next_batch(waiting: deque[_Waiting]) -> list[_Waiting]:
+    """Take the image that has waited longest, and those after it that can be localized with it.
+
+    An image with which a worker was lost goes alone, so that it takes no other with it.
+    """
+    batch = [waiting.popleft()]
+    first = batch[0]
+    while waiting and len(batch) < _MOST_TOGETHER and not first.lost:
+        task, following = first.task, waiting[0]
+        if following.lost or (following.task.bundle, following.task.is_distorted) != (task.bundle, task.is_distorted):
+            break
+        batch.append(waiting.popleft())
+    return batch
+
+
 class Workers:
     """Worker processes, each with every bundle loaded.
 
     Args:
         bundles: folders, or other models that :class:`~mambaloc.runtime.Localizer` takes, by name.
         count: how many processes.
-        seconds: that an image may take before its worker is replaced.
+        seconds: that an image may take before its worker is replaced; a batch, so many times as long.
 
     Raises:
         InputError: for a bundle that cannot be served.
@@ -85,7 +111,9 @@ class Workers:
         self.count, self.replaced = count, 0
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
         self._workers = [_Worker(bundles, seconds) for _ in range(count)]
-        self._idle: asyncio.Queue[_Worker] = asyncio.Queue()
+        self._idle: deque[_Worker] = deque()
+        self._waiting: deque[_Waiting] = deque()
+        self._jobs: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
         """Start all, and wait until they can localize.
@@ -101,8 +129,7 @@ class Workers:
             raise InputError(
                 "--workers: a worker process did not start. Free some memory, or use fewer workers."
             ) from None
-        for worker in self._workers:
-            self._idle.put_nowait(worker)
+        self._idle.extend(self._workers)
 
     def stop(self) -> None:
         """End all processes."""
@@ -111,25 +138,50 @@ class Workers:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def localize(self, task: Task) -> Answer:
-        """Localize an image on the worker that is idle next.
+        """Localize an image on the worker that is idle next, with others that wait for the same bundle.
 
         Raises:
             WorkerLostError: where several workers, one after another, were lost with it.
         """
+        waiting = _Waiting(task, asyncio.get_running_loop().create_future())
+        self._waiting.append(waiting)
+        self._hand_out()
+        try:
+            return await waiting.answer
+        finally:
+            with suppress(ValueError):  # it waits still: its client has gone
+                self._waiting.remove(waiting)
+
+    def _hand_out(self) -> None:
+        """Give each idle worker a batch, while any image waits."""
+        while self._idle and self._waiting:
+            job = asyncio.create_task(self._localize_batch(self._idle.popleft(), next_batch(self._waiting)))
+            self._jobs.add(job)  # the loop keeps no reference of its own
+            job.add_done_callback(self._jobs.discard)
+
+    async def _localize_batch(self, worker: _Worker, batch: list[_Waiting]) -> None:
         loop = asyncio.get_running_loop()
-        for left in reversed(range(_TRIES)):
-            worker = await self._idle.get()
-            try:
-                answer = await loop.run_in_executor(self._threads, worker.ask, task)
-            except WorkerLostError:
-                self.replaced += 1
-                loop.run_in_executor(self._threads, self._replace, worker, loop)
-                if not left:
-                    raise
-            else:
-                self._idle.put_nowait(worker)
-                return answer
-        raise AssertionError("unreachable")
+        try:
+            answers = await loop.run_in_executor(self._threads, worker.ask, [each.task for each in batch])
+        except WorkerLostError as error:
+            self.replaced += 1
+            loop.run_in_executor(self._threads, self._replace, worker, loop)
+            for each in reversed(batch):
+                each.lost += 1
+                if each.lost < _TRIES:
+                    self._waiting.appendleft(each)
+                elif not each.answer.done():
+                    each.answer.set_exception(error)
+        else:
+            self._idle.append(worker)
+            for each, answer in zip(batch, answers, strict=True):
+                if not each.answer.done():  # its client may have gone
+                    each.answer.set_result(answer)
+        self._hand_out()
+
+    def _is_ready(self, worker: _Worker) -> None:
+        self._idle.append(worker)
+        self._hand_out()
 
     def _replace(self, worker: _Worker, loop: asyncio.AbstractEventLoop) -> None:
         with suppress(RuntimeError):  # the loop has ended
@@ -138,7 +190,7 @@ class Workers:
                     worker.start()
                 except WorkerLostError:  # killed while it started
                     continue
-                loop.call_soon_threadsafe(self._idle.put_nowait, worker)
+                loop.call_soon_threadsafe(self._is_ready, worker)
                 return
 
 
@@ -160,14 +212,14 @@ class _Worker:
         theirs.close()  # so that the end of the process ends the pipe
         self._receive(_START_S)
 
-    def ask(self, task: Task) -> Answer:
-        """Have a task done."""
+    def ask(self, tasks: list[Task]) -> list[Answer]:
+        """Have tasks done."""
         assert self.pipe is not None
         try:
-            self.pipe.send(task)
+            self.pipe.send(tasks)
         except OSError:
             raise self._lost() from None
-        return self._receive(self.seconds)
+        return self._receive(self.seconds * len(tasks))
 
     def stop(self) -> None:
         """End the process."""
@@ -175,7 +227,7 @@ class _Worker:
         if self.process is not None:
             self._lost()
 
-    def _receive(self, seconds: float) -> Answer:
+    def _receive(self, seconds: float) -> list[Answer]:
         assert self.pipe is not None
         try:
             if self.pipe.poll(seconds):
@@ -212,24 +264,29 @@ def _work(pipe: Connection, bundles: Mapping[str, Path]) -> None:
     warnings.simplefilter("always")
     localizers = {name: Localizer(path, threads=1) for name, path in bundles.items()}
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        pipe.send({})
+        pipe.send([])
         while True:
-            task = pipe.recv()
-            pipe.send(_answer(localizers[task.bundle], task))
+            tasks = pipe.recv()
+            pipe.send(_answers(localizers[tasks[0].bundle], tasks))
     sys.exit()
 
 
-def _answer(localizer: Localizer, task: Task) -> Answer:
-    image = decode_image(task.picture)
-    if isinstance(image, str):
-        return {"error": image}
-    with warnings.catch_warnings(record=True) as told:
-        try:
-            found = localizer.localize(image, task.intrinsics, task.is_distorted)
-        except InputError as error:
-            return {"error": str(error)}
-    answer = {"bundle": task.bundle, "scene": localizer.scene, **pose_of(found)}
-    return answer | ({"warnings": [str(each.message) for each in told]} if told else {})
+def _answers(localizer: Localizer, tasks: list[Task]) -> list[Answer]:
+    """Localize images together; each alone, if one of them cannot be, so that it alone is refused."""
+    images = [decode_image(task.picture) for task in tasks]
+    answers: list[Answer] = []
+    try:
+        if rule := next((image for image in images if isinstance(image, str)), None):
+            raise InputError(rule)
+        found = localizer.localize_batch(images, [task.intrinsics for task in tasks], tasks[0].is_distorted)
+        for task in tasks:
+            with warnings.catch_warnings(record=True) as caught:
+                pose = next(found)
+            answer = {"bundle": task.bundle, "scene": pose.scene or localizer.scene, **pose_of(pose)}
+            answers.append(answer | ({"warnings": [str(each.message) for each in caught]} if caught else {}))
+    except InputError as error:
+        return [{"error": str(error)}] if len(tasks) == 1 else [_answers(localizer, [task])[0] for task in tasks]
+    return answers
 
 
 def pose_of(found: Localization) -> Answer:
@@ -244,6 +301,7 @@ def pose_of(found: Localization) -> Answer:
         "source": found.source,
         "is_accepted": found.is_accepted,
         "is_unfamiliar": found.is_unfamiliar,
+        "scene_probability": found.scene_probability,
         "inliers": found.inliers,
         "covariance": covariance,
         "latency_ms": round(1000 * found.latency_s, 3),

@@ -90,7 +90,8 @@ def _predictions(table: PoseErrorTable, told: Sequence[str]) -> Any:
 
     errors_deg = table.rotation_error_deg.cpu().numpy()
     bar = {"title": {"text": "rotation error [°]", "side": "right"}, "thickness": 14, "len": 0.6, "x": 0.99}
-    top_deg = max(1.0, float(np.percentile(errors_deg, 95)))
+    known_deg = errors_deg[np.isfinite(errors_deg)]
+    top_deg = max(1.0, float(np.percentile(known_deg, 95)) if len(known_deg) else 1.0)
     return Scatter3d(
         **_coordinates(table.predicted_position_m.cpu().numpy()),
         mode="markers",

@@ -31,7 +31,8 @@ def draw_top_view(table: PoseErrorTable, sequences: Sequence[str], path: Path, t
     true_m, predicted_m = (
         each.cpu().numpy()[:, [across, along]] for each in (table.true_position_m, table.predicted_position_m)
     )
-    low_m, high_m = np.vstack((true_m, predicted_m)).min(0), np.vstack((true_m, predicted_m)).max(0)
+    both_m = np.vstack((true_m, predicted_m))
+    low_m, high_m = np.nanmin(both_m, axis=0), np.nanmax(both_m, axis=0)  # frames without a pose are NaN
     margin_m = 0.04 * float((high_m - low_m).max()) or 1.0
     spans_m = high_m - low_m + 2 * margin_m
     height_in = np.clip(_WIDTH_IN * spans_m[1] / spans_m[0], _LEAST_HEIGHT_IN, _MOST_HEIGHT_IN)

@@ -76,7 +76,7 @@ def box_around(*tables: PoseErrorTable) -> NDArray[np.floating]:
     all_m = torch.cat(
         [m.cpu() for table in tables for m in (table.true_position_m, table.predicted_position_m)]
     ).numpy()
-    low_m, high_m = all_m.min(0), all_m.max(0)
+    low_m, high_m = np.nanmin(all_m, axis=0), np.nanmax(all_m, axis=0)  # frames without a pose are NaN
     half_m = np.maximum((high_m - low_m) / 2, 0.25 * (high_m - low_m).max())  # a flat path still gets a box to lie in
     return np.stack(((low_m + high_m) / 2 - half_m, (low_m + high_m) / 2 + half_m), axis=1)
 

@@ -19,14 +19,15 @@ POSITION, WXYZ = np.array([1.0, -2.0, 3.5]), np.array([0.5, -0.5, 0.5, 0.5])
 @pytest.mark.parametrize("name", ["found.bag", "found"])
 def test_poses_are_read_back(tmp_path, name):
     covariance = np.arange(36.0).reshape(6, 6)
-    with pose_bag(tmp_path / name, "hall") as write:
-        write(FIRST_NS, POSITION, WXYZ, covariance)
-        write(FIRST_NS + 1, POSITION, WXYZ, covariance)
+    with pose_bag(tmp_path / name) as write:
+        write(FIRST_NS, "hall", POSITION, WXYZ, covariance)
+        write(FIRST_NS + 1, "den", POSITION, WXYZ, covariance)
     assert is_bag(tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == [name]
     first, second = messages(tmp_path / name, TOPIC)
     stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in (first, second)]
-    assert (stamps, first.header.frame_id) == ([FIRST_NS, FIRST_NS + 1], "hall")
+    assert stamps == [FIRST_NS, FIRST_NS + 1]
+    assert (first.header.frame_id, second.header.frame_id) == ("hall", "den")
     at, turn = first.pose.pose.position, first.pose.pose.orientation
     assert (at.x, at.y, at.z) == tuple(POSITION)
     assert (turn.w, turn.x, turn.y, turn.z) == tuple(WXYZ)
@@ -35,11 +36,11 @@ def test_poses_are_read_back(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["found.bag", "found"])
 def test_an_error_leaves_nothing_and_nothing_is_overwritten(tmp_path, name):
-    with pytest.raises(ValueError, match="unpack"), pose_bag(tmp_path / name, "map") as write:
-        write(FIRST_NS, POSITION, WXYZ[:3], np.eye(6))
+    with pytest.raises(ValueError, match="unpack"), pose_bag(tmp_path / name) as write:
+        write(FIRST_NS, "map", POSITION, WXYZ[:3], np.eye(6))
     assert not list(tmp_path.iterdir())
     (tmp_path / name).touch()
-    with pytest.raises(InputError, match="already exists"), pose_bag(tmp_path / name, "map"):
+    with pytest.raises(InputError, match="already exists"), pose_bag(tmp_path / name):
         pass
 
 

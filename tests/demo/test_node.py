@@ -47,6 +47,18 @@ def test_poses_through_another_lens_in_node_are_pythons(kind, model, bundles_for
         assert rotation_error_deg(np.array(pose["quaternion_wxyz"]), expected.quaternion) < 0.05
 
 
+@pytest.mark.parametrize("model", ["model.onnx", "model.fp16.onnx"])
+def test_the_scene_in_node_is_pythons(model, bundle_of_two, modules, node):
+    found = json.loads(node(HERE / "replay.mjs", modules, WEB, bundle_of_two, model))
+    localizer = Localizer(bundle_of_two / model)
+    frames = json.loads((bundle_of_two / "contract.json").read_text())["frames"]
+    for pose, frame in zip(found, frames, strict=True):
+        expected = localizer.localize(bundle_of_two / frame["file"])
+        assert pose["scene"] == expected.scene
+        assert pose["scene_probability"] == pytest.approx(expected.scene_probability, abs=0.01)
+        assert pose["offset_m"] == list(localizer.world_of(expected).offset_m)
+
+
 CASES = [  # (height, width) of the image, short side, crop
     ((480, 640), 256, (224, 224)),
     ((240, 320), 78, (72, 96)),

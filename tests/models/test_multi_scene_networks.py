@@ -114,6 +114,8 @@ def test_a_pose_in_another_scenes_frame_is_no_pose(name):
     table = system.val_errors.table()
     assert (table.position_error_m.isfinite() == is_right).all()
     assert (table.rotation_error_deg.isfinite() == is_right).all()
+    assert (table.predicted_position_m.isfinite().all(dim=1) == is_right).all()
+    assert (table.predicted_quaternion.isfinite().all(dim=1) == is_right).all()
 
 
 def test_frames_of_one_scene_teach_the_outputs_of_no_other(name):

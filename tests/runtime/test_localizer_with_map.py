@@ -86,7 +86,7 @@ def test_the_networks_pose_is_what_the_map_searches_around(both, frame, monkeypa
     with pytest.raises(AttributeError):  # what stands in for an answer is none
         both.localize(frame)
     monkeypatch.undo()
-    alone = both._network.localize(read_image(frame))
+    alone = both._network.localize([read_image(frame)])[0]
     np.testing.assert_array_equal(priors[0].position_m, alone.position_m)
     expected = Rotation.from_quat(alone.quaternion, scalar_first=True).as_matrix()
     np.testing.assert_allclose(priors[0].rotation, expected, atol=1e-6)

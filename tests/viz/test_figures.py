@@ -4,6 +4,7 @@ import re
 import runpy
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from mambaloc.metrics import PoseErrors
 from mambaloc.types import PoseBatch, PosePrediction
 from mambaloc.viz.scene_page import write_scene_page
 from mambaloc.viz.top_view import draw_top_view, horizontal_axes
+from mambaloc.viz.trajectory import box_around, draw_trajectory
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -128,6 +130,23 @@ def test_the_page_names_every_frame_and_fetches_nothing(table, tmp_path):
     assert "median 1.000 m, 0.00°; mean 1.000 m, 0.00°; 12 frames" in page
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=", page)
     assert '"showSendToCloud": false' in page  # plotly 7 would offer to upload the chart
+
+
+@pytest.mark.parametrize("without", [[1, 5], range(12)])
+def test_frames_without_a_pose_are_left_out_of_every_figure(table, tmp_path, without):
+    rows = torch.isin(torch.arange(12), torch.tensor(list(without)))
+    lost = replace(
+        table,
+        predicted_position_m=table.predicted_position_m.masked_fill(rows[:, None], torch.nan),
+        position_error_m=table.position_error_m.masked_fill(rows, torch.inf),
+        rotation_error_deg=table.rotation_error_deg.masked_fill(rows, torch.inf),
+    )
+    draw_trajectory(lost, ["seq1"] * 12, tmp_path / "trajectory.png", "a place")
+    draw_top_view(lost, ["seq1"] * 12, tmp_path / "view.png", "a place")
+    write_scene_page(lost, ["seq1"] * 12, [f"{i}" for i in range(12)], tmp_path / "page.html", "a place")
+    assert all(cv2.imread(str(tmp_path / name)).std() > 5 for name in ("trajectory.png", "view.png"))
+    assert np.isfinite(box_around(lost)).all()
+    assert (box_around(lost)[:, 0] <= lost.true_position_m.numpy().min(axis=0) + 1e-4).all()
 
 
 def test_a_page_without_plotly_names_the_extra(table, tmp_path, monkeypatch):
