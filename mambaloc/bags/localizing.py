@@ -20,7 +20,7 @@ from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import Image
 from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.localizer import Localizer
-from mambaloc.runtime.video import Followed, summarize
+from mambaloc.runtime.video import VideoResult, summarize
 
 Straightener = Callable[[BagCamera, tuple[int, int]], tuple[Matrix, Callable[[Image], Image]]]
 """Of a camera and an image's size: intrinsics of images as the scene has them, and what makes an image so."""
@@ -38,7 +38,7 @@ def localize_bag(
     world: str | None = None,
     frame: str | None = None,
     on_picture: Callable[[BagImage, Image, ArrayLike | None, Localization], None] | None = None,
-) -> Followed:
+) -> VideoResult:
     """Localize every image of a bag, and write what a robot's filter takes: poses with covariances, at its times.
 
     A pose without radii says nothing to a filter, nor does that of an image that does not look like the place: these

@@ -141,7 +141,7 @@ def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict
         "float32": _on_onnx_runtime(exported, feeds, threads, _medians(median_errors(exported, data))),
         "float16": _on_onnx_runtime(half, feeds, threads, _medians(median_errors(half, data))),
         "int8" if int8.kind == "all layers" else f"int8 {int8.kind}": _on_onnx_runtime(
-            int8.model, feeds, threads, (int8.position_error_m, int8.rotation_error_deg), int8.fits
+            int8.model, feeds, threads, (int8.position_error_m, int8.rotation_error_deg), int8.within_tolerance
         ),
     }
 

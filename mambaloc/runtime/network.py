@@ -104,7 +104,7 @@ class Network:
         cameras = [(other.name, other.type, other.shape[-2:]) for other in others]
         if cameras != ([] if self.contract.intrinsics is None else [(INTRINSICS_INPUT, "tensor(float)", [3, 3])]):
             named = [other.name for other in others]
-            raise InputError(f"{self.path}: input {named} is not in its contract. Export the model again.")
+            raise InputError(f"{self.path}: input {named} does not match its contract. Export the model again.")
 
     def _feeds(self, rgb: Image, intrinsics: ArrayLike | None) -> dict[str, NDArray[np.generic]]:
         contract, size = self.contract, rgb.shape[:2]

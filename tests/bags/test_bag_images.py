@@ -132,7 +132,7 @@ def test_a_picture_with_too_few_bytes_is_named(record, rgb):
         (lambda bag, rgb: [bag.image("/a", FIRST_NS, of, rgb) for of in "bc"], "the frames 'b' and 'c'"),
         (lambda bag, rgb: [bag.image(f"/{of}", FIRST_NS, of, rgb) for of in "bc"], "images in /b, /c. Choose one"),
         (lambda bag, rgb: bag.pose_stamped("/a", FIRST_NS, "map", np.eye(4)), "has no topic of images"),
-        (lambda bag, rgb: bag.image("/a", FIRST_NS, "eye", rgb[..., 0].astype(np.uint16), "16UC1"), "no topic of pict"),
+        (lambda bag, rgb: bag.image("/a", FIRST_NS, "eye", rgb[..., 0].astype(np.uint16), "16UC1"), "no topic of imag"),
     ],
 )
 def test_what_is_not_read_is_refused(record, rgb, write, says):
@@ -155,7 +155,7 @@ def test_of_several_topics_that_with_a_camera_is_taken(record, rgb):
         assert image_topic(bag) == "/right/image_raw"
         assert image_topic(bag, "/left/image_raw") == "/left/image_raw"
         assert camera_of(bag, "/left/image_raw") is None
-        with pytest.raises(InputError, match=r"--topic /up: .*images: /left/image_raw, /right/image_raw"):
+        with pytest.raises(InputError, match=r"--topic /up: .*Choose one of /left/image_raw, /right/image_raw"):
             image_topic(bag, "/up")
 
 

@@ -156,7 +156,7 @@ def test_what_is_no_model(model, tmp_path):
         assert "\n" not in str(error.value)
 
     refused(tmp_path / "nothing.onnx", "no such model")
-    refused(tmp_path, "contains none of model.onnx")
+    refused(tmp_path, "contains no model.onnx")
     refusal = RuntimeError("Load model failed:\nProtobuf parsing failed.")  # as ONNX Runtime refuses a damaged file
     with mock.patch("onnxruntime.InferenceSession", side_effect=refusal):
         refused(model, r"ONNX Runtime cannot load it \(Load model failed:\); export it again")

@@ -199,7 +199,7 @@ def test_a_contract_with_a_wrong_camera_is_refused(wrong):
 
 def test_a_model_and_its_contract_agree_on_the_camera(tmp_path):
     without = replace(CONTRACT, intrinsics=None)
-    with pytest.raises(InputError, match=r"input \['intrinsics'\] is not in its contract"):
+    with pytest.raises(InputError, match=r"input \['intrinsics'\] does not match its contract"):
         Localizer(written(tmp_path / "a.onnx", without))
     model = onnx.ModelProto.FromString(ECHO.SerializeToString())
     model.graph.input[1].type.tensor_type.shape.dim[2].dim_value = 4
