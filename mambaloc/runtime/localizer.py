@@ -149,7 +149,7 @@ class Localizer:
             InputError: as :meth:`localize`, if any image cannot be localized: none is, then.
         """
         start = time.perf_counter()
-        matrices = list(intrinsics) if intrinsics is not None else [None] * len(images)
+        matrices: list[ArrayLike | None] = [None] * len(images) if intrinsics is None else list(intrinsics)
         rgb = [read_image(each) if isinstance(each, str | Path) else as_rgb(each) for each in images]
         if is_distorted:
             if any(matrix is not None for matrix in matrices):

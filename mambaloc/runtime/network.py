@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -76,7 +77,7 @@ class Network:
         rows = (row for batch in outputs for row in zip(*batch, strict=True))
         return [self._localization(dict(zip(self.contract.outputs, row, strict=True)), latency_s) for row in rows]
 
-    def _localization(self, found: dict[str, NDArray[np.generic]], latency_s: float) -> Localization:
+    def _localization(self, found: dict[str, NDArray[Any]], latency_s: float) -> Localization:
         radius_m, radius_deg, unfamiliarity = (float(found[name]) if name in found else None for name in UNCERTAINTY)
         answer = Localization(
             found["position_m"], found["quaternion_wxyz"], latency_s, radius_m, radius_deg, unfamiliarity

@@ -164,7 +164,7 @@ def test_network_and_map_are_given_one_camera(echo, den, map_of_den, monkeypatch
     path = den / "den/seq-02/frame-000002.color.png"
     intrinsics, given = SparseMap.load(map_of_den).intrinsics, []
     localize = Network.localize
-    monkeypatch.setattr(Network, "localize", lambda self, rgb, k: given.append(k) or localize(self, rgb, k))
+    monkeypatch.setattr(Network, "localize", lambda self, rgb, k: given.extend(k) or localize(self, rgb, k))
     found = Localizer(echo, 1, map_of_den).localize(read_image(path)[:100], intrinsics)
     assert found.source == "map"
     true_m = np.loadtxt(path.with_name("frame-000002.pose.txt"))[:3, 3]
