@@ -8,6 +8,7 @@
 
 from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -46,5 +47,10 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     if name in _EXPORTS:
-        return getattr(import_module(_EXPORTS[name]), name)
+        try:
+            return getattr(import_module(_EXPORTS[name]), name)
+        except ModuleNotFoundError as error:
+            if find_spec("torch") is None:
+                error.add_note(f"mambaloc.{name} needs PyTorch. Run: pip install 'mambaloc[train]'")
+            raise
     raise AttributeError(f"module 'mambaloc' has no attribute {name!r}")

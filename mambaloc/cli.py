@@ -15,7 +15,7 @@ import torch
 from jsonargparse import Namespace, class_from_function
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from mambaloc.callbacks import (
@@ -140,13 +140,16 @@ class RecipeCLI(LightningCLI):
             config.best_checkpoint.save_top_k = 0
 
     def instantiate_trainer(self, **kwargs: Any) -> L.Trainer:
-        """Log into the run's folder, and write checkpoints whole, unless the recipe names others that do."""
+        """Log into the run's folder and where the recipe says; write checkpoints whole unless it names a plugin."""
         config = self.config[self.subcommand]
         run_dir = str(run_directory(config))
         kwargs = {"default_root_dir": run_dir, **kwargs}
-        if config.trainer.logger in (None, True) and not config.trainer.fast_dev_run:
+        if config.trainer.logger is not False and not config.trainer.fast_dev_run:
+            named = self.config_init[self.subcommand].trainer.logger
+            others = named if isinstance(named, list) else [named] if isinstance(named, Logger) else []
             # TensorBoard first: checkpoints follow its place. A resumed run writes a CSV of its own beside the first.
-            kwargs["logger"] = [TensorBoardLogger(run_dir, name="", version=""), CSVLogger(run_dir, name="metrics")]
+            own = [TensorBoardLogger(run_dir, name="", version=""), CSVLogger(run_dir, name="metrics")]
+            kwargs["logger"] = [*own, *others]
         trainer = super().instantiate_trainer(**kwargs)
         if not config.trainer.plugins:
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()

@@ -6,10 +6,10 @@ import hashlib
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import resources
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -21,9 +21,11 @@ _MOST_JSON_BYTES = 2**30
 _LONGEST_PATH = 1024  # bytes; 255 for each part, as file systems have it
 
 
-def shipped_folders(name: str) -> tuple[Path, Path]:
-    """Where a folder of the project's top level may be: in a checkout, and in an installation."""
-    return Path(__file__).parents[1] / name, Path(sys.prefix) / "share/mambaloc" / name
+def shipped_folder(name: str) -> Path:
+    """Return ``zoo`` or ``recipes``: inside the package where it is installed, beside it in a checkout."""
+    package = Path(str(resources.files("mambaloc")))
+    shipped = package / "shipped" / name
+    return shipped if shipped.is_dir() else package.parent / name
 
 
 def sha256(path: Path) -> str:

@@ -45,8 +45,10 @@ def versions() -> dict[str, str]:
 
 def device_name(cuda_index: int | None = None) -> str:
     """Name the processor, or the CUDA device of an index."""
-    import torch  # only here: provenance is read by tools that run without it
-
+    try:
+        import torch  # only here: maps are built and measured without it
+    except ModuleNotFoundError:
+        return f"{_processor()}, {os.cpu_count()} threads"
     if cuda_index is not None:
         return torch.cuda.get_device_name(cuda_index)
     return f"{_processor()}, {torch.get_num_threads()} threads"

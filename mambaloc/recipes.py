@@ -5,20 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from mambaloc.errors import InputError, suggestion
-from mambaloc.files import shipped_folders
+from mambaloc.files import shipped_folder
 
-_FOLDERS = shipped_folders("recipes")
+_FOLDER = shipped_folder("recipes")
 
 
 def list_recipes() -> list[str]:
     """Names of the recipes that come with the package, such as ``quickstart`` and ``overlays/gis``, sorted."""
     return sorted(
-        {
-            path.relative_to(folder).with_suffix("").as_posix()
-            for folder in _FOLDERS
-            for pattern in ("*.yaml", "overlays/*.yaml")
-            for path in folder.glob(pattern)
-        }
+        path.relative_to(_FOLDER).with_suffix("").as_posix()
+        for pattern in ("*.yaml", "overlays/*.yaml")
+        for path in _FOLDER.glob(pattern)
     )
 
 
@@ -37,5 +34,5 @@ def recipe_path(recipe: str) -> Path:
         return path
     name = path.with_suffix("").as_posix().removeprefix("recipes/")
     if name in list_recipes():
-        return next(found for folder in _FOLDERS if (found := folder / f"{name}.yaml").is_file())
+        return _FOLDER / f"{name}.yaml"
     raise InputError(f"{recipe}: no such recipe. {suggestion(name, list_recipes())}")

@@ -20,9 +20,7 @@ class OneLineErrorParser(LightningArgumentParser):
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Raise what is wrong as an :class:`~mambaloc.errors.InputError`."""
-        chatter = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
-        lines = [line.strip() for line in str(message).splitlines()]
-        said = " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(chatter))
+        said = _without_chatter(str(message))
         unknown = re.search(r"Expected a dot import path string: (\w+)", said)
         if unknown and '"model' in said:
             systems = [model_class(name).__name__ for name in list_models()]
@@ -30,6 +28,17 @@ class OneLineErrorParser(LightningArgumentParser):
             raise InputError(f"model.class_path {unknown[1]}: no such class. {closest}")
         remedy = "; --help lists the options"  # a subcommand's parser reports to its parent, which reports again
         raise InputError(said.replace("typing.", "").removesuffix(remedy) + remedy)
+
+
+def _without_chatter(message: str) -> str:
+    """What is wrong, of a message of jsonargparse, in one line."""
+    chatter = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
+    chatter += ("Subclass types expect", "- a class path", "- a dict ")
+    lines = [line.strip() for line in message.splitlines()]
+    return " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(chatter))
+
+
+_REFUSING = ("lightning", "lightning_utilities", "jsonargparse")  # this for what a recipe's class raises when built
 
 
 @contextmanager
@@ -49,9 +58,9 @@ def tell_refusals(argv: list[str]) -> Iterator[None]:
         raise
     except Exception as error:
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        if frame.f_globals.get("__name__", "").partition(".")[0] not in ("lightning", "lightning_utilities"):
+        if frame.f_globals.get("__name__", "").partition(".")[0] not in _REFUSING:
             raise
-        reason, line = " ".join(str(error).split()), traceback.extract_tb(error.__traceback__)[-1].line
+        reason, line = _without_chatter(str(error)), traceback.extract_tb(error.__traceback__)[-1].line
         options = [word[2:].partition("=")[0] for word in argv if word.startswith("--") and "." in word]
         named = [name for name in options if name.partition(".")[2].rstrip("+") in f"{reason} {line}"]
         raise InputError(

@@ -25,6 +25,12 @@ def test_names_are_listed_without_torch():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_without_torch_a_name_says_what_to_install():
+    code = "import sys, mambaloc; sys.modules['torch'] = None; mambaloc.load"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.stderr.endswith("mambaloc.load needs PyTorch. Run: pip install 'mambaloc[train]'\n")
+
+
 @pytest.mark.parametrize(("pattern", "expected"), [("*", 2), ("student.*", 1), ("*loc*", 1), ("nothing*", 0)])
 def test_released_models_are_listed_by_wildcard(pattern, expected):
     names = mambaloc.list_models(pattern, pretrained=True)

@@ -1,6 +1,6 @@
 """``mambaloc benchmark``, from a checkout."""
 
-from mambaloc.commands.benchmark import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("benchmark")

@@ -1,6 +1,6 @@
 """``mambaloc demo``, from a checkout."""
 
-from mambaloc.commands.demo import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("demo")

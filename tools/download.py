@@ -1,6 +1,6 @@
 """``mambaloc download``, from a checkout."""
 
-from mambaloc.commands.download import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("download")

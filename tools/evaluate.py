@@ -1,6 +1,6 @@
 """``mambaloc evaluate``, from a checkout."""
 
-from mambaloc.commands.evaluate import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("evaluate")

@@ -1,6 +1,6 @@
 """``mambaloc export``, from a checkout."""
 
-from mambaloc.commands.export import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("export")

@@ -1,6 +1,6 @@
 """``mambaloc export-scene``, from a checkout."""
 
-from mambaloc.commands.export_scene import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("export-scene")

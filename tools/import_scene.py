@@ -1,6 +1,6 @@
 """``mambaloc import``, from a checkout."""
 
-from mambaloc.commands.import_scene import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("import")

@@ -1,6 +1,6 @@
 """``mambaloc localize``, from a checkout."""
 
-from mambaloc.commands.localize import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("localize")

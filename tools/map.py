@@ -1,6 +1,6 @@
 """``mambaloc map``, from a checkout."""
 
-from mambaloc.commands.map import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("map")

@@ -1,6 +1,6 @@
 """``mambaloc publish``, from a checkout."""
 
-from mambaloc.commands.publish import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("publish")

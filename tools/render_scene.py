@@ -1,6 +1,6 @@
 """``mambaloc render``, from a checkout."""
 
-from mambaloc.commands.render_scene import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("render")

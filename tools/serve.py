@@ -1,6 +1,6 @@
 """``mambaloc serve``, from a checkout."""
 
-from mambaloc.commands.serve import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("serve")

@@ -1,6 +1,6 @@
 """``mambaloc sweep``, from a checkout."""
 
-from mambaloc.commands.sweep import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("sweep")

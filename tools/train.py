@@ -1,6 +1,6 @@
 """``mambaloc train``, from a checkout."""
 
-from mambaloc.commands.train import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("train")

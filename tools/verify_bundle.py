@@ -1,6 +1,6 @@
 """``mambaloc verify``, from a checkout."""
 
-from mambaloc.commands.verify_bundle import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("verify")

@@ -1,6 +1,6 @@
 """``mambaloc visualize``, from a checkout."""
 
-from mambaloc.commands.visualize import main
+from mambaloc.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("visualize")

@@ -25,6 +25,12 @@ _MODULES = {
     "benchmark": ("benchmark", "measure speed, latency and size"),
     "publish": ("publish", "release a model"),
 }
+_TAKES_BUNDLES = ("localize", "demo", "serve")  # only the released model that they use by default needs PyTorch
+_OF_TRAINING = {
+    "huggingface_hub", "jsonargparse", "lightning", "onnx", "onnxscript", "tensorboard", "timm", "torch",
+    "torchmetrics", "typing_extensions",
+}  # fmt: skip
+"""Modules of the packages of the extra ``train``."""
 _USAGE = "usage: mambaloc COMMAND [...]\n\n{}\n\nmambaloc COMMAND --help lists a command's options."
 
 
@@ -38,4 +44,17 @@ def main() -> None:
         print(f"error: mambaloc {name}: no such command. {suggestion(name, _MODULES)}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [f"mambaloc {name}", *words]
-    import_module(f"{__name__}.{_MODULES[name][0]}").main()
+    run(name)
+
+
+def run(name: str) -> None:
+    """Run a subcommand on the words of ``sys.argv``; print one line if it needs PyTorch and PyTorch is not installed."""
+    try:
+        import_module(f"{__name__}.{_MODULES[name][0]}").main()
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in _OF_TRAINING:
+            raise
+        needy = f"mambaloc {name} without a bundle" if name in _TAKES_BUNDLES else f"mambaloc {name}"
+        remedy = "Run: pip install 'mambaloc[train]'"
+        print(f"error: {needy} needs PyTorch, which is not installed. {remedy}", file=sys.stderr)
+        raise SystemExit(2) from None

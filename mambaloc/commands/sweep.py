@@ -1,6 +1,7 @@
 """Train many recipes and report: mambaloc sweep run SWEEP.yaml, mambaloc sweep report RESULTS."""
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 
 from mambaloc.console import OptionParser, exits_cleanly, quieten
@@ -38,6 +39,8 @@ def _run(args: argparse.Namespace) -> None:
     if args.dry_run:
         print_plan(sweep, Store.ended(out))
         return
+    if args.address is None and find_spec("torch") is None:  # before each trial fails of it
+        raise ModuleNotFoundError("trials train on this machine", name="torch")
     ended = run_sweep(sweep, out, args.address, args.retry_failed)
     print(f"{out}: {ended['done']} trials done, {ended['failed']} failed, {ended['found']} from before")
 

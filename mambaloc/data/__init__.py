@@ -22,6 +22,10 @@ _EXPORTS = {
 __all__ = ["DATASETS", "BadFrames", "Frames", "MultiSceneDataModule", "PoseDataModule", "build_data"]
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 def __getattr__(name: str) -> Any:
     if name in _EXPORTS:
         return getattr(import_module(_EXPORTS[name]), name)

@@ -61,7 +61,7 @@ class MapErrors:
     cpu_s: Floats
 
     def summary(self) -> dict[str, float]:
-        """As :func:`~mambaloc.metrics.summarise_errors`, and how many poses are accepted and wrong.
+        """As :func:`~mambaloc.metrics.summarize_errors`, and how many poses are accepted and wrong.
 
         ``accepted_and_wrong`` and ``covariance_90`` are shares of accepted poses: of those more than 0.2 m or 5 degrees
         off, and of those whose covariance covers the truth.

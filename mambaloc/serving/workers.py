@@ -54,7 +54,7 @@ class Task:
     """
 
     bundle: str
-    picture: bytes
+    image: bytes
     intrinsics: tuple[tuple[float, ...], ...] | None = None
     is_distorted: bool = False
 
@@ -273,7 +273,7 @@ def _work(pipe: Connection, bundles: Mapping[str, Path]) -> None:
 
 def _answers(localizer: Localizer, tasks: list[Task]) -> list[Answer]:
     """Localize images together; each alone, if one of them cannot be, so that it alone is refused."""
-    images = [decode_image(task.picture) for task in tasks]
+    images = [decode_image(task.image) for task in tasks]
     answers: list[Answer] = []
     try:
         if rule := next((image for image in images if isinstance(image, str)), None):

@@ -13,19 +13,19 @@ from safetensors import SafetensorError
 from safetensors.torch import load as tensors_of
 
 from mambaloc.errors import InputError, suggestion
-from mambaloc.files import shipped_folders
+from mambaloc.files import shipped_folder
 from mambaloc.models import Checkpoint, LitPoseRegressor, registry
 from mambaloc.runtime.maps import MAP_FILE
 from mambaloc.zoo.manifest import MANIFEST_FILE, WEIGHTS_FILE, Manifest
 
-_ZOOS = shipped_folders("zoo")
+_ZOO = shipped_folder("zoo")
 
 _SOURCES = "Sources are a checkpoint, 'ARCH.TAG', 'local-dir:FOLDER' and 'hf-hub:ORG/NAME@REVISION'."
 
 
 def list_released() -> list[str]:
     """Names of the released models that are here, ``ARCH.TAG``, sorted."""
-    return sorted({manifest.parent.name for zoo in _ZOOS for manifest in zoo.glob(f"*/{MANIFEST_FILE}")})
+    return sorted(manifest.parent.name for manifest in _ZOO.glob(f"*/{MANIFEST_FILE}"))
 
 
 def list_models(pattern: str = "*", pretrained: bool = False) -> list[str]:
@@ -89,9 +89,8 @@ def released_folder(source: str) -> Path:
         return Path(rest)
     if colon and kind == "hf-hub":
         return _from_hub(rest)
-    for zoo in _ZOOS:
-        if re.fullmatch(r"[a-z0-9_]+\.[a-z0-9_]+", source) and (zoo / source / MANIFEST_FILE).is_file():
-            return zoo / source
+    if re.fullmatch(r"[a-z0-9_]+\.[a-z0-9_]+", source) and (_ZOO / source / MANIFEST_FILE).is_file():
+        return _ZOO / source
     raise InputError(f"{source}: no such model. {suggestion(source, list_released())} {_SOURCES}")
 
 

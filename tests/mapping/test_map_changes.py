@@ -2,7 +2,6 @@
 
 import json
 import re
-import runpy
 from pathlib import Path
 
 import cv2
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from mambaloc.commands import map as map_command
 from mambaloc.images import read_image
 from mambaloc.rendering import embedded_room, frames_of_sequences, write_7scenes
 from mambaloc.runtime.maps import SparseMap
@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def main(*argv):
-    runpy.run_path(str(ROOT / "tools" / "map.py"))["main"]([str(each) for each in argv])
+    map_command.main([str(each) for each in argv])
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """tools/map.py: recipes, what it writes, and real frames."""
 
 import json
-import runpy
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from mambaloc.commands.map import main
 from mambaloc.errors import InputError
 from mambaloc.mapping import evaluating
 from mambaloc.mapping.building import MapSettings
@@ -18,10 +18,6 @@ from mambaloc.runtime.maps import SparseMap
 
 ROOT = Path(__file__).parents[2]
 BLOCKS = ROOT / "recipes" / "map_redkitchen_blocks.yaml"
-
-
-def main(argv):
-    runpy.run_path(str(ROOT / "tools" / "map.py"))["main"](argv)
 
 
 def test_a_recipe_is_built_measured_and_written(den, tmp_path, capsys):

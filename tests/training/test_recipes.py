@@ -24,7 +24,8 @@ REPOSITORY = Path(__file__).parents[2]
 
 RECIPES = sorted({*(REPOSITORY / "recipes").glob("*.yaml")} - {*(REPOSITORY / "recipes").glob("map_*.yaml")})
 BLOCKS = REPOSITORY / "recipes/overlays/redkitchen_blocks.yaml"
-OVERLAYS = sorted({*BLOCKS.parent.glob("*.yaml")} - {BLOCKS, BLOCKS.with_name("gpu.yaml")})  # see test_gpu.py
+OTHERS = {BLOCKS, *(BLOCKS.with_name(f"{name}.yaml") for name in ("gpu", "mlflow", "wandb"))}  # test_gpu, test_trackers
+OVERLAYS = sorted({*BLOCKS.parent.glob("*.yaml")} - OTHERS)
 
 SYSTEMS = {system.__name__: system for system in (LitDistillation, *map(model_class, list_models()))}
 NARROW = {

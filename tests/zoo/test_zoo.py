@@ -98,7 +98,7 @@ def test_a_card_says_what_the_system_is(released):
 
 
 def test_a_name_finds_it(released, monkeypatch):
-    monkeypatch.setattr("mambaloc.zoo.loading._ZOOS", (released.parent,))
+    monkeypatch.setattr("mambaloc.zoo.loading._ZOO", released.parent)
     assert list_released() == ["mambaloc.tiny"]
     assert type(mambaloc.load("mambaloc.tiny")) is LitMambaLoc
     with pytest.raises(InputError, match=r"mambaloc\.tin: no such model. Did you mean mambaloc\.tiny"):

@@ -18,7 +18,7 @@ import torch
 
 from mambaloc import provenance
 from mambaloc.console import OptionParser, exits_cleanly, quieten
-from mambaloc.data.points.depth import NO_DEPTH_MM, depth_path, read_depth_intrinsics, read_depth_mm
+from mambaloc.data.depth_frames import NO_DEPTH_MM, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.images import read_image, resized
 from mambaloc.mapping import PosedFrames
 from mambaloc.mapping.posed import read_frames

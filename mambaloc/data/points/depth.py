@@ -1,41 +1,24 @@
 """Scene points from depth frames: ``frame-NNNNNN.depth.png`` beside the images, as 7-Scenes lays them out.
 
-A depth frame holds ``uint16`` millimetres along the optical axis; 0 and 65535 are pixels without a measurement. Its
-camera is ``SCENE/camera-intrinsics.txt`` (3x3, pixels of the depth frames) or, without such a file, the official depth
-sensor, whose view is narrower than the colour camera's: 585 px where that has 525. Both are taken to be in one place
-and to look one way; they are 25 mm apart.
+The depth sensor and the colour camera are taken to be in one place and to look one way; they are 25 mm apart.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
+from mambaloc.data.depth_frames import NO_DEPTH_MM, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.data.frames import Cameras, Frames
 from mambaloc.data.points.scene_points import Points, ScenePoints, choose, frame_rng, stacked
 from mambaloc.errors import InputError
-from mambaloc.geometry import project, resized_intrinsics, transform
-from mambaloc.text import decode_text
+from mambaloc.geometry import project, transform
 from mambaloc.types import Pose
-
-INTRINSICS_FILE = "camera-intrinsics.txt"
-_OFFICIAL_INTRINSICS = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])
-_OFFICIAL_SIZE = (640, 480)
-NO_DEPTH_MM = (0, 65535)
-"""What a depth frame has at pixels without a measurement."""
-_PNG_END = b"IEND\xaeB`\x82"  # OpenCV fills what a truncated file lacks with zeros and says nothing
-
-
-def depth_path(image: Path) -> Path:
-    """Where the depth frame of an image is, if it has one."""
-    return image.with_name(f"{image.name.partition('.')[0]}.depth.png")
 
 
 def depth_rows(frames: Frames) -> list[int]:
@@ -74,51 +57,9 @@ def read_depth_points(folder: Path, frames: Frames, cameras: Cameras, count: int
     return ScenePoints(stacked(points, count), "depth")
 
 
-def read_whole_png(path: Path) -> NDArray[Any] | None:
-    """The numbers of a PNG as they are stored; None where the file cannot be read, or is not whole."""
-    try:
-        data = path.read_bytes()
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data.endswith(_PNG_END) else None
-    except (OSError, cv2.error):
-        return None
-
-
-def read_depth_mm(path: Path) -> NDArray[np.uint16]:
-    """Read a depth frame, (H, W).
-
-    Raises:
-        InputError: where it is not a complete 16-bit PNG of one channel.
-    """
-    depth_mm = read_whole_png(path)
-    if depth_mm is None or depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
-        raise InputError(f"{path}: is not a complete 16-bit PNG of one channel. Repair or remove it.")
-    return depth_mm
-
-
 def _size(depth_mm: NDArray[np.uint16]) -> tuple[int, int]:
     height, width = depth_mm.shape
     return width, height
-
-
-def read_depth_intrinsics(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The camera of depth frames of a size (width, height), (3, 3).
-
-    Raises:
-        InputError: where the folder's file of it does not hold a pinhole matrix.
-    """
-    path = folder / INTRINSICS_FILE
-    if not path.is_file():
-        scale = (size[0] / _OFFICIAL_SIZE[0], size[1] / _OFFICIAL_SIZE[1])
-        return resized_intrinsics(torch.from_numpy(_OFFICIAL_INTRINSICS), *scale).numpy()
-    try:
-        lines = decode_text(path.read_bytes()).splitlines()
-        matrix = np.array([line.split() for line in lines if line.strip()], dtype=float)
-    except (ValueError, OSError):
-        matrix = np.empty(0)
-    is_pinhole = matrix.shape == (3, 3) and np.isfinite(matrix).all() and np.allclose(matrix[2], (0, 0, 1))
-    if not is_pinhole or min(matrix[0, 0], matrix[1, 1]) <= 0 or matrix[1, 0] != 0:
-        raise InputError(f"{path}: is not a pinhole matrix 'fx 0 cx, 0 fy cy, 0 0 1' in pixels; correct or remove it")
-    return matrix
 
 
 def _sample(

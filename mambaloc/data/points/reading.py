@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from mambaloc.data.colmap import COLMAP_FOLDERS, colmap_folder
+from mambaloc.data.depth_frames import depth_path
 from mambaloc.data.frames import Cameras, Frames
 from mambaloc.data.nvm import NVM_FILE
 from mambaloc.data.points.colmap import read_colmap_points
-from mambaloc.data.points.depth import depth_path, depth_rows, read_depth_points
+from mambaloc.data.points.depth import depth_rows, read_depth_points
 from mambaloc.data.points.nvm import read_nvm_points
 from mambaloc.data.points.scene_points import ScenePoints
 from mambaloc.data.points.tracks import read_track_points

@@ -17,9 +17,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mambaloc.data.depth_frames import NO_DEPTH_MM, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.frames import Frames
-from mambaloc.data.points.depth import NO_DEPTH_MM, depth_path, depth_rows, read_depth_intrinsics, read_depth_mm
+from mambaloc.data.points.depth import depth_rows
 from mambaloc.errors import InputError
 from mambaloc.runtime.maps.viewpoints import farthest_points, spread_m, viewpoints
 from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from filelock import FileLock
 
+from mambaloc.data.depth_frames import INTRINSICS_FILE, depth_path
 from mambaloc.data.frame_dataset import LoadedSplit
-from mambaloc.data.points.depth import INTRINSICS_FILE, depth_path
 from mambaloc.data.views.depth import VIEW_DEPTHS, FoundDepth, ViewDepth, depth_of_frames, poses_of
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.files import whole_folder

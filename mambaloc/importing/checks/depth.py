@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.data.points.depth import NO_DEPTH_MM, read_depth_mm, read_whole_png
+from mambaloc.data.depth_frames import NO_DEPTH_MM, read_depth_mm, read_whole_png
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture, Depth
 from mambaloc.importing.checks.epipolar import apart_of

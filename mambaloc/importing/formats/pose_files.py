@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mambaloc.data.points.depth import INTRINSICS_FILE, depth_path, read_depth_intrinsics, read_depth_mm
+from mambaloc.data.depth_frames import INTRINSICS_FILE, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.errors import InputError
 from mambaloc.images import list_images, stored_size
 from mambaloc.importing.capture import Camera, Capture

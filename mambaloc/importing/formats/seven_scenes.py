@@ -12,8 +12,8 @@ import numpy as np
 
 from mambaloc.data.cameras import frame_intrinsics
 from mambaloc.data.datasets.seven_scenes import read_split
+from mambaloc.data.depth_frames import depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.data.frames import BadFrames, Split
-from mambaloc.data.points.depth import depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.images import stored_size
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import Pose, Posed, build_capture, pinhole

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mambaloc.data.points.depth import read_depth_mm
+from mambaloc.data.depth_frames import read_depth_mm
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, stored_size
 from mambaloc.importing.capture import Camera, Capture
