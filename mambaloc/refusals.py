@@ -32,8 +32,10 @@ class OneLineErrorParser(LightningArgumentParser):
 
 def _without_chatter(message: str) -> str:
     """What is wrong, of a message of jsonargparse, in one line."""
-    chatter = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
-    chatter += ("Subclass types expect", "- a class path", "- a dict ")
+    chatter = (
+        *("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value"),
+        *("Subclass types expect", "- a class path", "- a dict "),
+    )
     lines = [line.strip() for line in message.splitlines()]
     return " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(chatter))
 

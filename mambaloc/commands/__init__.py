@@ -28,7 +28,7 @@ _MODULES = {
 _TAKES_BUNDLES = ("localize", "demo", "serve")  # only the released model that they use by default needs PyTorch
 _OF_TRAINING = {
     "huggingface_hub", "jsonargparse", "lightning", "onnx", "onnxscript", "tensorboard", "timm", "torch",
-    "torchmetrics", "typing_extensions",
+    "torchmetrics",
 }  # fmt: skip
 """Modules of the packages of the extra ``train``."""
 _USAGE = "usage: mambaloc COMMAND [...]\n\n{}\n\nmambaloc COMMAND --help lists a command's options."
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def run(name: str) -> None:
-    """Run a subcommand on the words of ``sys.argv``; print one line if it needs PyTorch and PyTorch is not installed."""
+    """Run a subcommand on the words of ``sys.argv``; print one line if it needs PyTorch, which is missing."""
     try:
         import_module(f"{__name__}.{_MODULES[name][0]}").main()
     except ModuleNotFoundError as error:

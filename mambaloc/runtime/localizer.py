@@ -148,9 +148,9 @@ class Localizer:
         Raises:
             InputError: as :meth:`localize`, if any image cannot be localized: none is, then.
         """
-        start = time.perf_counter()
         matrices: list[ArrayLike | None] = [None] * len(images) if intrinsics is None else list(intrinsics)
         rgb = [read_image(each) if isinstance(each, str | Path) else as_rgb(each) for each in images]
+        start = time.perf_counter()
         if is_distorted:
             if any(matrix is not None for matrix in matrices):
                 raise InputError("intrinsics: distorted images have those of their lens. Leave out one.")

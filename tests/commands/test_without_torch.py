@@ -15,7 +15,7 @@ from mambaloc import commands
 
 ROOT = Path(__file__).parents[2]
 NEED_TORCH = ("train", "evaluate", "export", "visualize", "benchmark", "publish")
-HIDDEN = sorted(commands._OF_TRAINING - {"typing_extensions"})  # which Starlette needs, too
+HIDDEN = sorted(commands._OF_TRAINING)
 
 
 def mambaloc(*calls):
