@@ -46,7 +46,7 @@ class WrittenBundle:
 
     Args:
         deviations: of each model in the bundle from PyTorch.
-        int8: how quantisation went, where it was asked for; left out unless it ``fits``.
+        int8: how quantisation went, where it was asked for; left out unless it is ``within_tolerance``.
         unsure: why the models estimate no uncertainty, if they do not.
     """
 

@@ -254,7 +254,7 @@ def test_no_good_image_is_an_error_even_when_skipping(images, store):
     for path in images:
         path.write_bytes(b"")
     bad = BadFrames("skip")
-    with pytest.raises(InputError, match="none of 4 images can be used"):
+    with pytest.raises(InputError, match="none of 4 images can be decoded"):
         cached_frames(images, 24, bad, store)
     assert bad.counts() == {"image cannot be decoded": 4}
 

@@ -96,7 +96,7 @@ def test_of_an_imported_scene_without_cameras_a_usual_one_is_assumed(imported, c
         frame_intrinsics("capture", imported, frames)
     for image in frames.image_paths:
         cv2.imwrite(str(image), np.zeros((40, 20, 3), np.uint8))
-    with pytest.warns(InputWarning, match=r"scene\.json: does not say .* A focal length of 0\.87 .* is assumed"):
+    with pytest.warns(InputWarning, match=r"scene\.json: has no focal length .* A focal length of 0\.87 .* is assumed"):
         found = known_or_assumed_cameras("capture", imported, frames)
     np.testing.assert_allclose(found.intrinsics, [[[0.87 * 40, 0, 9.5], [0, 0.87 * 40, 19.5], [0, 0, 1]]] * 3)
     assert found.is_assumed

@@ -325,7 +325,7 @@ def test_depth_that_cannot_be_used_gives_way_to_the_pictures_unless_it_was_asked
         "thousandth": disagrees,
         "thousandfold": disagrees,
         "empty": r"depth.png: depth has no measured pixel, and no other depth frame can be used. Repair them, or set",
-        "none": "no training frame has depth. Set data.view_depth to images",
+        "none": "no training frame has depth. Set data.view_depth to pictures",
         "few": "10 of 40 training frames have depth, too few",
     }[change]
     if change != "few":
@@ -362,9 +362,9 @@ def test_poor_views_are_left_out_and_the_training_goes_on(make, tmp_path, monkey
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"clip_length": 3}, "data.clip_length 3: data.views are single images"),
+        ({"clip_length": 3}, "data.clip_length 3: clips need sequences, but data.views are single images"),
         ({"views": -1}, "data.views -1: must be 0 or more"),
-        ({"view_depth": "lidar"}, "data.view_depth 'lidar': choose one of auto, sensor, images"),
+        ({"view_depth": "lidar"}, "data.view_depth 'lidar': choose one of auto, sensor, pictures"),
         ({"view_share": 1.0}, "data.view_share 1: must be 0 or more and less than 1"),
         ({"batch_size": 1}, "data.batch_size 1: is too small for a frame and a view"),
     ],

@@ -11,7 +11,7 @@ import torch
 from mambaloc.data import PoseDataModule
 from mambaloc.errors import InputError
 from mambaloc.evaluation.predict import localize_test_frames
-from mambaloc.export import contract_of, export_onnx, quantisation, write_bundle
+from mambaloc.export import contract_of, export_onnx, quantization, write_bundle
 from mambaloc.export.quantization import eight_bit, median_errors, sensitive_nodes
 from mambaloc.metrics import summarize
 from mambaloc.models.student import LitStudent
@@ -68,12 +68,12 @@ def test_all_bits_of_a_weight_are_used(int8):
 
 
 def test_what_is_kept_when_all_layers_lose_too_much(network, data, monkeypatch):
-    monkeypatch.setattr(quantisation, "LARGEST_LOSS", -1.0)  # nothing can be so good
+    monkeypatch.setattr(quantization, "LARGEST_LOSS", -1.0)  # nothing can be so good
     found = eight_bit(network, data)
     assert found.kind == "mixed"
     assert not found.within_tolerance
     assert "left out" in str(found)
-    kept = sensitive_nodes(quantisation._prepared(network).graph)
+    kept = sensitive_nodes(quantization._prepared(network).graph)
     quantized = {name for node in found.model.graph.node if node.name in kept for name in node.input}
     assert not any("Dequantize" in name for name in quantized)
 
@@ -102,7 +102,7 @@ def test_a_bundle_ships_what_fits_and_says_how_it_went(student, data, tmp_path):
 
 
 def test_a_bundle_leaves_out_what_loses_too_much(student, data, tmp_path, monkeypatch):
-    monkeypatch.setattr(quantisation, "LARGEST_LOSS", -1.0)
+    monkeypatch.setattr(quantization, "LARGEST_LOSS", -1.0)
     written = write_bundle(student, data, tmp_path / "bundle", ("onnx", "int8"))
     assert [each.file for each in written.deviations] == ["model.onnx"]
     assert not written.int8.within_tolerance

@@ -168,7 +168,7 @@ def _contradiction(found: Agreement) -> str:
     if found.is_guessed and max(share, float(found.focal_share.max())) < _AGREE:
         return (
             f"only {share:.0%} of matches between images agree with the poses, and no focal length makes more agree "
-            "agree than chance: the poses may be inaccurate, of other images, or meant otherwise than they were read; "
+            "than chance: the poses may be inaccurate, of other images, or meant otherwise than they were read; "
             "compare choices with how the file was written"
         )
     if share < _AGREE and not found.is_guessed and not found.is_of_another_lens:

@@ -153,7 +153,7 @@ def test_no_usable_frame_is_an_error_even_when_skipping(write_tiny_scene):
     for pose in scene.folder.glob("seq-01/*.pose.txt"):
         pose.write_text(POSE_TEXT.replace("0.5", "nan"))
     bad = BadFrames("skip")
-    with pytest.raises(InputError, match=r"TrainSplit\.txt: its sequences contain no usable frame"):
+    with pytest.raises(InputError, match=r"TrainSplit\.txt: its sequences have no usable frame"):
         read_split(scene.folder, "train", bad)
     assert bad.counts() == {"pose has NaN or infinite numbers": 2}
 

@@ -368,7 +368,7 @@ def test_a_damaged_archive_leaves_no_scene(server: Server, tmp_path: Path) -> No
 
 def test_another_archive_than_a_scenes_is_refused(server: Server, tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"contains no TrainSplit.txt and TestSplit.txt: it is not a scene of 7-Scenes"
+        InputError, match=r"contains no TrainSplit.txt and TestSplit.txt, so it is not a scene of 7-Scenes"
     ):
         get(server.source(zipped({"readme.txt": b""})), tmp_path)
 

@@ -216,7 +216,7 @@ def test_depth_of_another_size_is_named(tiny):
 
 def test_no_point_at_all_is_an_error(tiny):
     write_depth(tiny.images[0], np.zeros((24, 32), np.uint16))
-    assert "its depth contains no point for any of 3 frames" in one_line(tiny.folder)
+    assert "its depth has no point for any of 3 frames" in one_line(tiny.folder)
 
 
 def test_without_any_source_the_three_places_are_named(tiny):

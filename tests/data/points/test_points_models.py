@@ -203,7 +203,7 @@ def test_a_model_in_another_frame_or_scale_is_refused(yard, a, b, says):
         ("NVM_V3\n-1\n", "line 2: is not the number of cameras"),
         ("NVM_V3\n1e3\n", "line 2: is not the number of cameras"),
         (f"NVM_V3\n{'9' * 5000}\n", "line 2: is not the number of cameras"),
-        ("NVM_V3\n999999999999999\n" + CAMERAS[0], "ends after 1 of 999999999999999 cameras; it is cut off"),
+        ("NVM_V3\n999999999999999\n" + CAMERAS[0], "ends after 1 of 999999999999999 cameras; it is truncated"),
         ("NVM_V3\n2\n" + CAMERAS[0] + "\n\n1\n" + POINTS[0], "line 5: is not a camera"),
         ("NVM_V3\n1\n" + "\n".join(CAMERAS), "line 4: is not the number of points"),
         (nvm([CAMERAS[0].replace("100", "x")], []), "line 4: is not a camera"),
@@ -233,7 +233,7 @@ def test_a_model_in_another_frame_or_scale_is_refused(yard, a, b, says):
         ("NVM_V3\n" + "1" * (1 << 22), "line 2: is too long"),
         (nvm(["seq9/z.jpg 100 1 0 0 0 1 2 3 0 0"], []), "contains none of 4 frames, such as"),
         (nvm([". 100 1 0 0 0 1 2 3 0 0"], []), "contains none of 4 frames, such as"),
-        (nvm(CAMERAS, POINTS[3:]), "its nvm contains no point for any of 4 frames"),
+        (nvm(CAMERAS, POINTS[3:]), "its nvm has no point for any of 4 frames"),
         ("NVM_V3\n\x00\xff\n", "line 2: is not the number of cameras"),
     ],
 )
@@ -312,7 +312,7 @@ def test_a_damaged_colmap_model_is_named_in_one_line(yard, file, keep):
     damaged.write_bytes(damaged.read_bytes()[:keep])
     with (
         mock.patch("pycolmap.Reconstruction", side_effect=AssertionError("COLMAP would read past the end")),
-        pytest.raises(InputError, match=rf"sparse/0/{file}: is cut off") as caught,
+        pytest.raises(InputError, match=rf"sparse/0/{file}: is truncated") as caught,
     ):
         read(yard)
     assert "\n" not in str(caught.value)
@@ -321,12 +321,12 @@ def test_a_damaged_colmap_model_is_named_in_one_line(yard, file, keep):
 @pytest.mark.parametrize(
     ("file", "line", "says"),
     [
-        ("points3D.txt", "", "its colmap contains no point for any of 4 frames"),
+        ("points3D.txt", "", "its colmap has no point for any of 4 frames"),
         ("cameras.txt", "1 PINHOLE 0 60 100 102 41 29\n", "holds a camera without a size"),
         ("cameras.txt", "1 PINHOLE 80 60 0 102 41 29\n", "holds a camera without a size"),
         ("cameras.txt", "1 PINHOLE 80 60 nan 102 41 29\n", "is not a COLMAP model that pycolmap can read"),
         ("cameras.txt", "1 PINHOLE\n", "is not a COLMAP model that pycolmap can read"),
-        ("images.txt", "text\n\n", "images.txt, line 1: is not an image 'IMAGE_ID QW"),
+        ("images.txt", "text\n\n", "images.txt, line 1: is neither an image 'IMAGE_ID QW"),
     ],
 )
 def test_a_damaged_text_model_is_named_in_one_line(yard, file, line, says):

@@ -174,7 +174,7 @@ def test_a_line_that_is_no_picture_is_named_with_the_rule(tmp_path, kind):
     file = tmp_path / "capture/sparse/0/images.txt"
     file.write_text(file.read_text() + "25 1 0.5 0 0 0 0 0 1\n")  # without its name
     with pytest.raises(
-        InputError, match=r"images\.txt, line (50|26): is not an image .* two lines an image, the second empty"
+        InputError, match=r"images\.txt, line (50|26): is neither an image .* two lines an image, the second empty"
     ):
         read_capture(tmp_path / "capture")
 

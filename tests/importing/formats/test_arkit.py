@@ -118,7 +118,8 @@ def test_what_is_no_recording(record3d, refused, tmp_path):
     whole = (record3d / "metadata").read_text()
     for content in (whole[: len(whole) // 2], "[]", "", "[" * 100_000):
         (record3d / "metadata").write_text(content)
-        refused(read_record3d, record3d, "metadata: is not JSON")
+        rule = "metadata: is not a JSON object" if content == "[]" else "metadata: is not JSON"
+        refused(read_record3d, record3d, rule)
     (record3d / "metadata").unlink()
     refused(read_record3d, record3d, "metadata.json: cannot be read")
     (tmp_path / "a.r3d").write_bytes(b"PK")

@@ -157,7 +157,7 @@ def test_replica_frames_are_found_by_their_number(replica, recording):
             "traj.txt, line 1: the pose's",
         ),
         ("../cam_params.json", "{", "cam_params.json: is not JSON"),
-        ("../cam_params.json", "[1]", "cam_params.json: is not JSON"),
+        ("../cam_params.json", "[1]", "cam_params.json: is not a JSON object"),
         ("../cam_params.json", "{}", "'camera: w h fx fy cx cy' must be 6 finite numbers"),
         ("../cam_params.json", '{"camera": {"w": 64, "h": 48}}', "must be 6 finite numbers"),
         (

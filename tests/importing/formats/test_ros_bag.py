@@ -161,7 +161,7 @@ def test_pictures_are_held_one_by_one(record, drive, monkeypatch):
             most = max(most, sum(ref() is not None for ref in alive))
             yield picture
 
-    monkeypatch.setattr(ros_bag, "pictures_of", watched)
+    monkeypatch.setattr(ros_bag, "images_of", watched)
     read_ros_bag(record(lambda bag: (write_pictures(bag, drive), write_poses(bag, drive))))
     assert len(alive) == FRAMES
     assert most <= 4
