@@ -101,7 +101,7 @@ class _Lines:
         for read in range(count):
             line = self.next()
             if not line:
-                raise InputError(f"{self.path}: ends after {read} of {count} {what}; it is cut off, get it again")
+                raise InputError(f"{self.path}: ends after {read} of {count} {what}; it is truncated, get it again")
             yield line
 
     def error(self, rule: str) -> InputError:
