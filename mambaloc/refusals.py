@@ -32,10 +32,10 @@ class OneLineErrorParser(LightningArgumentParser):
 
 def _without_chatter(message: str) -> str:
     """What is wrong, of a message of jsonargparse, in one line."""
-    chatter = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
-    chatter += ("Subclass types expect", "- a class path", "- a dict ")
+    of_values = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
+    of_classes = ("Subclass types expect", "- a class path", "- a dict ")
     lines = [line.strip() for line in message.splitlines()]
-    return " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(chatter))
+    return " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(of_values + of_classes))
 
 
 _REFUSING = ("lightning", "lightning_utilities", "jsonargparse")  # this for what a recipe's class raises when built
