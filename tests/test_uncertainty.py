@@ -191,7 +191,7 @@ def test_errors_are_those_of_an_evaluation(scenes):
         ({"validation": "test_set"}, "data.validation test_set: .* needs held-out frames"),
         (
             {"validation": "block", "val_fraction": 0.1, "val_gap": 1},
-            "data.validation block: 2 frames held out, 9 tell",
+            "data.validation block: 2 frames are held out, but calibrating the uncertainty takes 9",
         ),
     ],
 )

@@ -109,7 +109,7 @@ def check_export(out):
 
 def bundle(inputs, out):
     if not (out / "bundle").exists():
-        write_bundle(student(), scene(inputs), out / "bundle", ("onnx", "fp16"))
+        write_bundle(student(), scene(inputs), out / "bundle", ("onnx", "fp16"), raw_input=False)
 
 
 def bundle_converted(inputs, out):

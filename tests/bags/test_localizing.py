@@ -71,7 +71,7 @@ def drive(made_once):
         tool("train", recipe, *options, "--trainer.default_root_dir", folder / "run")
         checkpoint = folder / "run/checkpoints/last.ckpt"
         tool("evaluate", checkpoint, "--out", folder / "evaluated", "--accelerator", "cpu")
-        tool("export", checkpoint, "--to", "onnx", "--out", folder / "bundle")
+        tool("export", checkpoint, "--to", "onnx", "--no-raw-input", "--out", folder / "bundle")
 
     return made_once("drive", make)
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 import pytest
 
 from mambaloc.demo import build_site, embedded_video, serve
-from mambaloc.demo import film as film_module
+from mambaloc.demo import video as video_module
 from mambaloc.demo.site import node_modules
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -90,7 +90,7 @@ def _export(out, root, scene, formats=("onnx",), raw_input=False, knows_its_fram
 def film():
     """The video of the embedded scene, a tenth of its length."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(film_module, "_FRAMES", 24)
+        patch.setattr(video_module, "_FRAMES", 24)
         return embedded_video()
 
 

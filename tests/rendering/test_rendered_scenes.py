@@ -213,7 +213,7 @@ def table(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("scene,split,image\n", "line 1: columns x, y, z are missing"),
+        ("scene,split,image\n", "line 1: columns x, y, z, qw, qx, qy, qz are missing"),
         (HEADER, "has no row of scene 'den'"),
         (HEADER + ROW + ROW.replace(",1,2", ",one,2"), "line 3: x,y,z,qw,qx,qy,qz must be seven numbers"),
         (HEADER + "den,train,den/seq-01/frame-000000.color.png,1,2\n", "line 2: x,y,z,qw,qx,qy,qz must be"),

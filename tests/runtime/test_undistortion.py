@@ -190,9 +190,9 @@ class Echo:
     def __init__(self, undistortion: Undistortion) -> None:
         self.contract = replace(CONTRACT, undistortion=undistortion)
 
-    def localize(self, rgb, intrinsics=None):
-        self.given = rgb, intrinsics
-        return Localization(np.zeros(3), np.array([1.0, 0, 0, 0]), 0.0)
+    def localize(self, images, intrinsics=None):
+        self.given = images[0], intrinsics[0]
+        return [Localization(np.zeros(3), np.array([1.0, 0, 0, 0]), 0.0)]
 
 
 def localizer_of(undistortion):

@@ -24,8 +24,8 @@ class Echo:
 
     contract = Contract(**{**CONTRACT.__dict__, "world": GRID})
 
-    def localize(self, rgb, intrinsics=None):
-        return Localization(np.array([0.2072, 0.5531, -0.4352], np.float32), np.array([1.0, 0, 0, 0]), 0.0)
+    def localize(self, images, intrinsics=None):
+        return [Localization(np.array([0.2072, 0.5531, -0.4352], np.float32), np.array([1.0, 0, 0, 0]), 0.0)]
 
 
 def test_a_localizer_answers_in_the_sources_world():

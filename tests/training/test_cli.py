@@ -63,7 +63,7 @@ def test_misplaced_recipe_is_refused(words, rule, tmp_path, monkeypatch):
         (["--model.backbone", "resnet10x"], ["resnet10x", "resnet10t"]),
         (["--ckpt_path", "nothing.ckpt"], ["nothing.ckpt"]),
         (["--data.image_size", "64"], ["short_side"]),
-        (["--retrieval", "true"], ["retrieval", "scratch"]),
+        (["--retrieval", "true"], ["retrieval: needs a pretrained backbone", "model.backbone_weights"]),
         (["--trainer.enable_checkpointing", "false"], ["enable_checkpointing", "save_top_k"]),
         (["--trainer.strategy", "nonsense"], ["trainer.strategy: Lightning refuses it", "ddp_spawn"]),
         (["--trainer.val_check_interval", "100"], ["trainer.val_check_interval: Lightning refuses it", "(100)"]),

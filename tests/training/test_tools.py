@@ -101,7 +101,7 @@ def test_a_checkpoint_is_published(trained_student, tmp_path, capsys):
         ("verify_bundle", ["nothing"], "give a bundle's folder"),
         ("verify_bundle", ["{run}"], "give a bundle's folder"),
         ("localize", ["nothing.onnx", "0"], "nothing.onnx: no such model"),
-        ("localize", ["{run}", "0"], "contains none of model.onnx"),
+        ("localize", ["{run}", "0"], "contains no model.onnx"),
         ("localize", ["student.embedded_rom", "0"], "Did you mean student.embedded_room?"),
         ("localize", ["{bundle}", "nothing.mp4"], "no such file, folder or camera"),
         ("publish", ["{run}/recipe.yaml", "--tag", "a"], "recipe.yaml"),

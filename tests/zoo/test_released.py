@@ -16,13 +16,12 @@ ZOO = Path(__file__).parents[2] / "zoo"
 NAMES = ["denseloc.embedded_room", "student.embedded_room"]
 
 
-def test_they_are_small_and_in_the_wheel():
+def test_they_are_small():
     shipped = sorted(path for path in ZOO.iterdir() if path.is_dir())
     assert [path.name for path in shipped] == NAMES
     assert set(NAMES) <= set(list_released())
     for folder in shipped:
         assert sum(file.stat().st_size for file in folder.iterdir()) < 8e6
-        assert f'"zoo/{folder.name}/*"' in (ZOO.parent / "pyproject.toml").read_text()
 
 
 @pytest.mark.slow
