@@ -206,10 +206,13 @@ class _Worker:
         """Start the process, and wait until its bundles are loaded."""
         context = get_context("spawn")  # a fork would copy the server's threads and sockets
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, self.bundles), daemon=True)
+        process = context.Process(target=_work, args=(theirs, self.bundles), daemon=True)
         with _environment(_ENVIRONMENT):
-            self.process.start()
+            process.start()
+        self.process = process  # one that has not started cannot be killed
         theirs.close()  # so that the end of the process ends the pipe
+        if self.is_stopped:
+            raise self._lost()
         self._receive(_START_S)
 
     def ask(self, tasks: list[Task]) -> list[Answer]:

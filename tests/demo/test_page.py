@@ -285,7 +285,7 @@ def test_a_camera_is_localized(opened):
     ("shape", "message"),
     [
         ((120, 60, 3), "too narrow"),
-        (None, "no image that this browser can read"),
+        (None, "is not an image that this browser can read"),
         ((120, 160, 4), "has transparent parts"),
     ],
 )

@@ -1,6 +1,5 @@
 """A server of two bundles, asked over HTTP as clients do."""
 
-import asyncio
 import http.client
 import json
 import os
@@ -14,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
+import event_loop
 import numpy as np
 import pytest
 
@@ -215,7 +215,7 @@ def test_a_worker_that_hangs_is_replaced_and_its_picture_tried_again(bundles, fr
         finally:
             workers.stop()
 
-    answer, replaced = asyncio.run(localize())
+    answer, replaced = event_loop.run(localize())
     assert answer["source"] == "network"
     assert replaced == 1
 
@@ -235,7 +235,7 @@ def test_a_picture_that_ends_every_worker_is_given_up(bundles, frame, monkeypatc
     def ended(worker):
         raise WorkerLostError
 
-    assert asyncio.run(localize()) == 3
+    assert event_loop.run(localize()) == 3
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import asyncio
 from collections import deque
 
+import event_loop
 import numpy as np
 import pytest
 
@@ -76,7 +77,7 @@ def test_pictures_that_come_at_once_share_a_worker_and_a_bad_one_is_refused_alon
         finally:
             workers.stop()
 
-    answers = asyncio.run(localize())
+    answers = event_loop.run(localize())
     assert sizes == [1, 4, 3]
     assert answers[4] == {"error": "image cannot be decoded"}
     alone = Localizer(bundle_of_tensors, threads=1)
@@ -101,7 +102,7 @@ def test_a_picture_whose_client_has_gone_is_not_localized(bundle_of_tensors, fra
         finally:
             workers.stop()
 
-    first, second, third = asyncio.run(localize())
+    first, second, third = event_loop.run(localize())
     assert isinstance(second, asyncio.CancelledError)
     assert first["source"] == third["source"] == "network"
     assert asked == [tasks[0], tasks[2]]

@@ -1,12 +1,12 @@
 """One network for two rendered scenes, from the recipe to the bundle."""
 
-import asyncio
 import csv
 import json
 import subprocess
 import sys
 from pathlib import Path
 
+import event_loop
 import numpy as np
 import pytest
 import yaml
@@ -111,7 +111,7 @@ def test_the_service_says_the_scene_of_each_image(bundle_of_two):
         finally:
             workers.stop()
 
-    for frame, answer in zip(frames, asyncio.run(localize()), strict=True):
+    for frame, answer in zip(frames, event_loop.run(localize()), strict=True):
         expected = Localizer(bundle_of_two, threads=1).localize(frame)
         assert answer["scene"] == expected.scene
         assert answer["scene_probability"] == pytest.approx(expected.scene_probability, abs=1e-4)
