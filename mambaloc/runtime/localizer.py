@@ -63,6 +63,11 @@ class Localizer:
         return None if self._map is None else self._map.map
 
     @property
+    def runs_batches(self) -> bool:
+        """Whether images that come together take less time: of a network that takes tensors, without a map."""
+        return self.contract is not None and not self.contract.preprocessing.in_model and self._map is None
+
+    @property
     def scene(self) -> str:
         """Name of the place, as the network's contract has it, or the map alone."""
         return self._place.scene

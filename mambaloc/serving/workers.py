@@ -14,7 +14,7 @@ import sys
 import threading
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ _ENVIRONMENT = {  # of a worker: it has a core, and the memory of images that ca
 }
 
 Answer = dict[str, Any]
-"""Describe an image's result for JSON: its pose, or ``error``, the rule that it breaks."""
+"""An image's result, ready for JSON: its pose, or ``error``, the rule that it breaks."""
 
 
 @dataclass(frozen=True)
@@ -72,14 +72,19 @@ class _Waiting:
     lost: int = 0
 
 
-def next_batch(waiting: deque[_Waiting]) -> list[_Waiting]:
+def next_batch(waiting: deque[_Waiting], batched: Collection[str]) -> list[_Waiting]:
     """Take the image that has waited longest, and those after it that can be localized with it.
 
     An image with which a worker was lost goes alone, so that it takes no other with it.
+
+    Args:
+        waiting: in the order in which they came.
+        batched: names of bundles that gain by it; images of others go alone, each to the worker that is idle next.
     """
     batch = [waiting.popleft()]
     first = batch[0]
-    while waiting and len(batch) < _MOST_TOGETHER and not first.lost:
+    most = _MOST_TOGETHER if first.task.bundle in batched and not first.lost else 1
+    while waiting and len(batch) < most:
         task, following = first.task, waiting[0]
         if following.lost or (following.task.bundle, following.task.is_distorted) != (task.bundle, task.is_distorted):
             break
@@ -108,6 +113,7 @@ class Workers:
         localizers = {name: Localizer(path, threads=1) for name, path in bundles.items()}
         self.scenes = {name: each.scene for name, each in localizers.items()}
         self.without_lens = [name for name, each in localizers.items() if each.undistortion.lens is None]
+        self._batched = {name for name, each in localizers.items() if each.runs_batches}
         self.count, self.replaced = count, 0
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
         self._workers = [_Worker(bundles, seconds) for _ in range(count)]
@@ -155,7 +161,8 @@ class Workers:
     def _hand_out(self) -> None:
         """Give each idle worker a batch, while any image waits."""
         while self._idle and self._waiting:
-            job = asyncio.create_task(self._localize_batch(self._idle.popleft(), next_batch(self._waiting)))
+            batch = next_batch(self._waiting, self._batched)
+            job = asyncio.create_task(self._localize_batch(self._idle.popleft(), batch))
             self._jobs.add(job)  # the loop keeps no reference of its own
             job.add_done_callback(self._jobs.discard)
 

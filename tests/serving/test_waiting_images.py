@@ -19,6 +19,7 @@ def waiting(*tasks: tuple[str, bool, int]) -> deque[_Waiting]:
 
 
 DEN, DISTORTED, LOST, HALL = ("den", False, 0), ("den", True, 0), ("den", False, 1), ("hall", False, 0)
+RAW = ("raw", False, 0)
 
 
 @pytest.mark.parametrize(
@@ -29,11 +30,12 @@ DEN, DISTORTED, LOST, HALL = ("den", False, 0), ("den", True, 0), ("den", False,
         ([DEN, HALL, DEN, DEN], [1, 1, 2]),
         ([DISTORTED, DISTORTED, DEN], [2, 1]),
         ([LOST, LOST, DEN, DEN, LOST, DEN], [1, 1, 2, 1, 1]),
+        ([RAW, RAW, DEN], [1, 1, 1]),
     ],
 )
 def test_batches_hold_what_one_bundle_localizes_alike_and_pictures_that_cost_a_worker_go_alone(tasks, sizes):
     left = waiting(*tasks)
-    batches = [next_batch(left) for _ in sizes]
+    batches = [next_batch(left, {"den", "hall"}) for _ in sizes]
     assert [len(batch) for batch in batches] == sizes
     assert not left
 
@@ -54,6 +56,11 @@ def test_a_batch_has_the_poses_of_its_images_alone(request, frames, kind):
         np.testing.assert_allclose(found.position_m, alone.position_m, atol=1e-5)
         np.testing.assert_allclose(found.quaternion, alone.quaternion, atol=1e-5)
         assert (found.source, found.is_unfamiliar) == (alone.source, alone.is_unfamiliar)
+
+
+@pytest.mark.parametrize(("kind", "runs_batches"), [("bundle_of_tensors", True), ("bundle_of_pictures", False)])
+def test_a_model_of_raw_input_gains_nothing_by_batches(request, kind, runs_batches):
+    assert Localizer(request.getfixturevalue(kind), threads=1).runs_batches is runs_batches
 
 
 def test_a_batch_with_an_image_that_cannot_be_localized_has_no_poses(bundle_of_tensors, frames):
