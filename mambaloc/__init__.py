@@ -6,10 +6,10 @@
 >>> system = mambaloc.create_model("mambaloc", gis="gis")  # a LightningModule; .network is a plain nn.Module
 """
 
-from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mambaloc.lazy import lazy
 
 if TYPE_CHECKING:
     from mambaloc.data import PoseDataModule
@@ -45,12 +45,4 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def __getattr__(name: str) -> Any:
-    if name in _EXPORTS:
-        try:
-            return getattr(import_module(_EXPORTS[name]), name)
-        except ModuleNotFoundError as error:
-            if find_spec("torch") is None:
-                error.add_note(f"mambaloc.{name} needs PyTorch. Run: pip install 'mambaloc[train]'")
-            raise
-    raise AttributeError(f"module 'mambaloc' has no attribute {name!r}")
+__getattr__ = lazy(__name__, _EXPORTS)

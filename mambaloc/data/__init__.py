@@ -1,7 +1,8 @@
 """Scenes on disk to batches of posed images."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mambaloc.lazy import lazy
 
 if TYPE_CHECKING:
     from mambaloc.data.datamodule import PoseDataModule
@@ -26,7 +27,4 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def __getattr__(name: str) -> Any:
-    if name in _EXPORTS:
-        return getattr(import_module(_EXPORTS[name]), name)
-    raise AttributeError(f"module 'mambaloc.data' has no attribute {name!r}")
+__getattr__ = lazy(__name__, _EXPORTS)

@@ -1,8 +1,8 @@
 """Pose errors over a whole split."""
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from mambaloc.lazy import lazy
 from mambaloc.renamed import renamed
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ _EXPORTS = {
 
 __all__ = ["RECALL_THRESHOLDS", "PoseErrorTable", "PoseErrors", "error_table", "summarize", "summarize_errors"]
 
+_exported = lazy(__name__, _EXPORTS)
 _renamed = renamed(__name__, {"summarise": "summarize", "summarise_errors": "summarize_errors"})
 
 
@@ -29,6 +30,4 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    if name in _EXPORTS:
-        return getattr(import_module(_EXPORTS[name]), name)
-    return _renamed(name)
+    return _exported(name) if name in _EXPORTS else _renamed(name)
