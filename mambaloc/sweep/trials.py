@@ -13,6 +13,7 @@ from typing import Any
 
 from mambaloc.errors import InputError
 from mambaloc.files import read_yaml
+from mambaloc.recipes import recipe_path
 
 _KEYS = ("axes", "common_args", "exclude", "time_limit_s", "cpus", "gpus")
 _RENAMED = {"always": "common_args", "without": "exclude"}
@@ -153,9 +154,11 @@ def _digest(path: Path, args: tuple[str, ...], after: tuple[str, ...]) -> str:
     for arg in args:
         if arg.endswith(_FILES):
             try:
-                digest.update(Path(arg).read_bytes())
+                digest.update(recipe_path(arg).read_bytes())
             except OSError as error:
                 raise InputError(f"{path}: {arg} cannot be read ({error.strerror}); name a recipe or overlay") from None
+            except InputError as error:
+                raise InputError(f"{path}: {error}") from None
     return digest.hexdigest()
 
 
