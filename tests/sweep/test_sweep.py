@@ -124,7 +124,7 @@ def test_a_trial_comes_after_the_one_whose_run_it_needs(folder):
         ({"axes": {}}, "has no 'axes'"),
         ({"axes": {"a": {}}}, "axis a has no labels"),
         ({"axes": {"a": {"x": "r.yaml"}}}, "give a list of recipes"),
-        ({"axes": {"a": {"x": ["none.yaml"]}}}, "none.yaml cannot be read"),
+        ({"axes": {"a": {"x": ["none.yaml"]}}}, "none.yaml: no such recipe"),
         ({"axes": {"a": {"x": ["r.yaml"]}}, "seeds": 3}, "unknown key seeds; choose among axes"),
         ({"axes": {"a": {"x": ["r.yaml"]}}, "always": []}, "'always' is now called 'common_args'. Rename"),
         ({"axes": {"a": {"x": ["r.yaml"]}}, "without": []}, "'without' is now called 'exclude'. Rename"),
@@ -333,6 +333,17 @@ def test_a_real_training_is_a_trial(scenes, tiny_recipe, tmp_path, monkeypatch):
     median_m = np.median(frames["position_error_m"])
     assert median_m == pytest.approx(trial.results["last"]["metrics"]["position_error_m"], rel=1e-5)
     assert run_folder(tmp_path / "out", trial.key).is_dir()
+
+
+def test_recipes_of_the_package_are_found_outside_of_a_checkout(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = Path("sweep.yaml")
+    path.write_text(yaml.safe_dump({"axes": {"system": {"student": ["recipes/student_embedded.yaml"]}}}))
+    (before,) = read_sweep(path).trials
+    Path("recipes").mkdir()
+    Path("recipes/student_embedded.yaml").write_text("model: {}")  # the reader's own comes first, and is another trial
+    (after,) = read_sweep(path).trials
+    assert before.args == after.args and before.key != after.key
 
 
 def test_every_shipped_sweep_names_recipes_that_are_there(monkeypatch, capsys):
