@@ -1,4 +1,4 @@
-"""README and docs: their commands and options exist, their links lead somewhere. test_code_blocks.py runs the blocks."""
+"""README and docs: commands and options exist, links lead somewhere. test_code_blocks.py runs the blocks."""
 
 import importlib
 import re

@@ -343,7 +343,8 @@ def test_recipes_of_the_package_are_found_outside_of_a_checkout(tmp_path, monkey
     Path("recipes").mkdir()
     Path("recipes/student_embedded.yaml").write_text("model: {}")  # the reader's own comes first, and is another trial
     (after,) = read_sweep(path).trials
-    assert before.args == after.args and before.key != after.key
+    assert before.args == after.args
+    assert before.key != after.key
 
 
 def test_every_shipped_sweep_names_recipes_that_are_there(monkeypatch, capsys):
