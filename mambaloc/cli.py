@@ -28,6 +28,7 @@ from mambaloc.callbacks import (
     PoseProgressBar,
     TimeBudget,
     TrajectoryPlot,
+    ViewRefresh,
     ViewSheet,
     WallClock,
 )
@@ -85,6 +86,7 @@ class RecipeCLI(LightningCLI):
             "onnx_export": OnnxExport,
             "trajectory_plot": TrajectoryPlot,
             "view_sheet": ViewSheet,
+            "view_refresh": ViewRefresh,
             "best_checkpoint": ModelCheckpoint,
             "last_checkpoint": ModelCheckpoint,  # a callback of its own: `save_last` follows the best one only
         }.items():
