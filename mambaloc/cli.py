@@ -8,6 +8,7 @@ import sys
 import time
 from datetime import datetime
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import lightning as L
@@ -27,6 +28,7 @@ from mambaloc.callbacks import (
     PoseProgressBar,
     TimeBudget,
     TrajectoryPlot,
+    ViewRefresh,
     ViewSheet,
     WallClock,
 )
@@ -59,7 +61,7 @@ class SaveRecipe(SaveConfigCallback):
         name = "config_resumed.yaml" if self.config.get("ckpt_path") else "config.yaml"
         path = Path(trainer.default_root_dir, name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.parser.save(self.config, path, skip_none=False, overwrite=True, multifile=False)
+        self.parser.save(self.config, path, skip_unset=False, overwrite=True, multifile=False)
 
 
 class RecipeCLI(LightningCLI):
@@ -84,6 +86,7 @@ class RecipeCLI(LightningCLI):
             "onnx_export": OnnxExport,
             "trajectory_plot": TrajectoryPlot,
             "view_sheet": ViewSheet,
+            "view_refresh": ViewRefresh,
             "best_checkpoint": ModelCheckpoint,
             "last_checkpoint": ModelCheckpoint,  # a callback of its own: `save_last` follows the best one only
         }.items():
@@ -120,6 +123,8 @@ class RecipeCLI(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """Without validation no epoch is better than another; what only fails at the end is refused here."""
         config = self.config[self.subcommand]
+        _refuse_null("data", config.data, PoseDataModule)
+        _refuse_null("model", config.model.init_args, resolve_name(config.model.class_path))
         if config.get("retrieval") and not config.model.init_args.get("backbone_weights"):
             raise InputError(
                 "retrieval: needs a pretrained backbone. Set model.backbone_weights, or retrieval to false."
@@ -242,6 +247,15 @@ def run_directory(config: Namespace) -> Path:
         run_dir = Path("runs", name, stamp)
     os.environ[_RUN_DIR] = str(run_dir)
     return run_dir
+
+
+def _refuse_null(section: str, given: Namespace, cls: type) -> None:
+    """Refuse ``null`` where a parameter has another default: jsonargparse takes it whatever the annotation says."""
+    signatures = [inspect.signature(base.__init__).parameters.values() for base in reversed(cls.__mro__)]  # type: ignore[misc]
+    defaults = {each.name: each.default for signature in signatures for each in signature}
+    for name, value in given.items():
+        if value is None and defaults.get(name) not in (None, inspect.Parameter.empty):
+            raise InputError(f"{section}.{name} null: needs a value. Leave it out for the default, {defaults[name]}.")
 
 
 def recipe_arguments(argv: list[str]) -> list[str]:

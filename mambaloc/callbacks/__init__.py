@@ -7,6 +7,7 @@ from mambaloc.callbacks.onnx_export import OnnxExport
 from mambaloc.callbacks.progress import PoseProgressBar
 from mambaloc.callbacks.time_budget import TimeBudget
 from mambaloc.callbacks.trajectory_plot import TrajectoryPlot
+from mambaloc.callbacks.view_refresh import ViewRefresh
 from mambaloc.callbacks.view_sheet import ViewSheet
 from mambaloc.callbacks.wall_clock import WallClock
 from mambaloc.callbacks.whole_checkpoints import AtomicCheckpointIO
@@ -21,6 +22,7 @@ __all__ = [
     "PoseProgressBar",
     "TimeBudget",
     "TrajectoryPlot",
+    "ViewRefresh",
     "ViewSheet",
     "WallClock",
 ]

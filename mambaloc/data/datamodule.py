@@ -9,7 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
+from lightning.fabric.utilities import move_data_to_device
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler
 
@@ -21,12 +24,14 @@ from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.frames import Frames, OnBadFrame, Split
 from mambaloc.data.scene import Scene
 from mambaloc.data.splits import Validation
-from mambaloc.data.views import FramesAndViews, MixedSampler, SceneViews, ViewDepth
+from mambaloc.data.views import FramesAndViews, MixedSampler, SceneViews, ViewDepth, points_of_views
 from mambaloc.errors import InputError
 from mambaloc.geometry import cropped_intrinsics
 from mambaloc.images import center_corner
+from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
 from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
+from mambaloc.synthesis import Views
 from mambaloc.types import PoseBatch
 
 
@@ -185,6 +190,35 @@ class PoseDataModule(L.LightningDataModule):
     def scene_views(self) -> SceneViews | None:
         """Views of the training frames, and how good they are, once training batches were asked for."""
         return self.scene.made_views
+
+    @property
+    def view_rows(self) -> NDArray[np.int64]:
+        """Rows of the training images, as ``PoseBatch.index`` has them, that are views."""
+        data = self.scene.items("train")
+        return np.arange(len(data.frames), len(data.clips)) if isinstance(data, FramesAndViews) else np.arange(0)
+
+    def replace_views(self, rows: NDArray[np.int64], views: Views) -> None:
+        """Train on N views in place of those in N of the :attr:`view_rows`, from the next batch on."""
+        for data in {id(each): each for each in (self.scene.items("train"), self._data("train"))}.values():
+            if isinstance(data, FramesAndViews):
+                count = 0 if data.points_m is None else data.points_m.shape[1]
+                points = points_of_views(views, count, provenance.seed()) if count else None
+                data.replace_views(rows, views, points)
+
+    def training_batches(self, rows: NDArray[np.int64], epoch: int, size: int) -> Iterator[PoseBatch]:
+        """Training images of some rows, ``size`` a batch, as the training sees them in an epoch."""
+        data = self._data("train")
+        for start in range(0, len(rows), size):
+            batch = data.__getitems__(rows[start : start + size].tolist())
+            yield self.augmented(move_data_to_device(batch, self._device), epoch)
+
+    def poses_of_rows(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Poses ``world_from_cam`` of some training images, views among them, (N, 4, 4)."""
+        data = self.scene.items("train")
+        return rigid_transforms(
+            matrix_from_quaternion(data.quaternion[rows].double().cpu().numpy()),
+            data.position_m[rows].double().cpu().numpy(),
+        )
 
     def frames(self, part: Split) -> Frames:
         """Return the frames of a part, in the order of ``PoseBatch.index``."""

@@ -191,7 +191,7 @@ class Scene:
         key = self.parts["train"].fingerprint
         if self._mixed is None:
             return key
-        poses = hashlib.sha256(self._mixed.views.world_from_cam.tobytes()).hexdigest()
+        poses = hashlib.sha256(self._mixed.views.first.world_from_cam.tobytes()).hexdigest()
         return f"{key} {poses} {self._mixed.share}"
 
     def _made_views(self, device: torch.device) -> SceneViews | None:
@@ -230,9 +230,14 @@ class Scene:
             "short_side": self.short_side,
             "cameras": {part: loaded.data.cameras.describe() for part, loaded in self.parts.items()},
             **describe_points(self.parts),
-            **({"views": self.made_views.describe() if self.made_views else {"count": 0}} if self._is_viewed else {}),
+            **({"views": self._describe_views()} if self._is_viewed else {}),
             **(describe_capture(self.folder) if self.dataset == CAPTURE else {}),
         }
+
+    def _describe_views(self) -> dict[str, Any]:
+        described = self.made_views.describe() if self.made_views else {"count": 0}
+        replaced = self._mixed.views.replaced if self._mixed else 0
+        return {**described, "replaced": replaced} if replaced else described
 
     def _marked(self) -> Read | None:
         """Frames that the scene marks for validation, and the frames left out."""

@@ -8,6 +8,7 @@ import shutil
 import warnings
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from mambaloc.data.views import MixedSampler
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.rendering import embedded_room, embedded_walk, frames_of_sequences, render
 from mambaloc.rendering.scenes.layouts import write_7scenes
-from mambaloc.synthesis import gate
+from mambaloc.synthesis import Views, gate
 from mambaloc.synthesis import views as making_views
 
 SIZE, SHORT_SIDE, CROP = (96, 72), 48, (40, 56)
@@ -411,3 +412,19 @@ def test_where_views_and_points_cannot_be_had_the_training_goes_on_without_both(
     batch = next(iter(data.train_dataloader()))
     assert batch.points_m is None
     assert len(batch.index) == 8
+
+
+@pytest.mark.parametrize("resident", [False, True])
+def test_other_views_take_the_place_of_some(resident, make):
+    data = make(resident=resident, points_per_frame=8)
+    loader, new = data.train_dataloader(), data.scene_views.views
+    rows = data.view_rows[[3, 0, 23]]
+    before = loader.dataset.__getitems__(data.view_rows.tolist())
+    data.replace_views(rows, Views(*(getattr(new, field.name)[[7, 8, 9]] for field in fields(Views))))
+    after = loader.dataset.__getitems__(data.view_rows.tolist())
+    kept = [place for place in range(24) if place not in (3, 0, 23)]
+    for name in ("image", "holes", "position_m", "quaternion", "intrinsics", "points_m"):
+        torch.testing.assert_close(getattr(after, name)[kept], getattr(before, name)[kept], equal_nan=True)
+    np.testing.assert_array_equal(after.image[[3, 0, 23]], new.images[[7, 8, 9]])
+    np.testing.assert_array_equal(after.holes[[3, 0, 23]], np.isnan(new.depth_m[[7, 8, 9]]))
+    np.testing.assert_allclose(data.poses_of_rows(rows), new.world_from_cam[[7, 8, 9]], atol=1e-6)

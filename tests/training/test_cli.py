@@ -56,6 +56,8 @@ def test_misplaced_recipe_is_refused(words, rule, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        (["--data.scene", "null"], ["data.scene null: needs a value", "the default, heads"]),
+        (["--model.lr", "null"], ["model.lr null: needs a value", "the default, 0.0001"]),
         (["--data.scene", "fire"], ["fire", "mambaloc download 7scenes fire"]),
         (["--model.gis", "both"], ["gis"]),
         (["--model", "LitMambaLok"], ["LitMambaLok", "LitMambaLoc"]),

@@ -14,6 +14,7 @@ from torch.utils.data import DistributedSampler
 
 from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.points import ScenePoints
+from mambaloc.data.views.pool import ViewPool
 from mambaloc.errors import InputError
 from mambaloc.memory import release_pages
 from mambaloc.runtime.rotations import quaternion_from_matrix
@@ -33,7 +34,7 @@ class FramesAndViews(CachedFrames):
 
     def __init__(self, real: CachedFrames, views: Views, share: float, points: ScenePoints | None = None) -> None:
         super().__init__(real.frames, real.images, real.cameras, real.points)
-        self.views, self.share = views, share
+        self.views, self.share = ViewPool(views), share
         self.resident_holes: Tensor | None = None
         pose = views.world_from_cam
         self.position_m = _joined(self.position_m, pose[:, :3, 3])
@@ -46,29 +47,44 @@ class FramesAndViews(CachedFrames):
     @property
     def nbytes(self) -> int:
         """Of all images."""
-        return self.images.nbytes + self.views.images.nbytes
+        return self.images.nbytes + self.views.nbytes
 
     def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Images of some rows, frames' and views', (B, 3, H, W)."""
-        count = len(self.frames)
-        pictures = np.stack([self.images[row] if row < count else self.views.images[row - count] for row in rows])
+        rows = np.asarray(rows)
+        is_view = rows >= len(self.frames)
+        pictures = np.empty((len(rows), *self.images.shape[1:]), np.uint8)
+        pictures[~is_view] = self.images[rows[~is_view]]
         release_pages(self.images)
-        release_pages(self.views.images)
+        pictures[is_view] = self.views.images(rows[is_view] - len(self.frames))
         return pictures
+
+    def replace_views(self, rows: NDArray[np.int64], views: Views, points: ScenePoints | None = None) -> None:
+        """Put N views in the place of those in N rows, with the points that each shows if the frames carry points."""
+        device, pose = self.position_m.device, views.world_from_cam
+        self.views.replace(rows - len(self.frames), views)
+        self.position_m[rows] = _like(self.position_m, pose[:, :3, 3])
+        self.quaternion[rows] = _like(self.quaternion, quaternion_from_matrix(pose[:, :3, :3]))
+        self.intrinsics[rows] = _like(self.intrinsics, views.intrinsics)
+        if self.points_m is not None and points is not None:
+            self.points_m[rows] = _like(self.points_m, points.points_m)
+        if self.resident is not None and self.resident_holes is not None:
+            self.resident[rows] = torch.from_numpy(self.pictures(rows)).to(device)
+            self.resident_holes[rows] = torch.from_numpy(self.holes(rows)).to(device)
 
     def to(self, device: torch.device) -> Self:
         """Return the same frames and views, whole in a device's memory."""
         there = super().to(device)
+        there.views = self.views.copy()
         there.resident_holes = torch.from_numpy(self.holes(range(len(self.clips)))).to(device)
         return there
 
     def holes(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which pixels of some rows show nothing of the scene, (B, H, W): those of views without depth."""
+        rows = np.asarray(rows)
+        is_view = rows >= len(self.frames)
         holes = np.zeros((len(rows), *self.images.shape[2:]), dtype=bool)
-        for place, row in enumerate(rows):
-            if (view := row - len(self.frames)) >= 0:
-                np.isnan(self.views.depth_m[view], out=holes[place])
-        release_pages(self.views.depth_m)
+        holes[is_view] = self.views.holes(rows[is_view] - len(self.frames))
         return holes
 
     def __getitems__(self, items: list[int]) -> PoseBatch:
@@ -80,7 +96,11 @@ class FramesAndViews(CachedFrames):
 
 
 def _joined(real: Tensor, views: NDArray[np.floating]) -> Tensor:
-    return torch.cat((real, torch.from_numpy(np.array(views)).to(real)))
+    return torch.cat((real, _like(real, views)))
+
+
+def _like(real: Tensor, values: NDArray[np.floating]) -> Tensor:
+    return torch.from_numpy(np.array(values)).to(real)
 
 
 class MixedSampler(DistributedSampler[int]):
