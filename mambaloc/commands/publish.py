@@ -1,4 +1,4 @@
-"""Release a model: mambaloc publish CHECKPOINT --tag TAG [--zoo zoo]."""
+"""Release a model: mambaloc publish CHECKPOINT --tag TAG [--zoo zoo] [--half]."""
 
 from pathlib import Path
 
@@ -14,6 +14,7 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--tag", required=True, help="TAG of the released name ARCH.TAG")
     parser.add_argument("--zoo", type=Path, default=Path("zoo"), help="folder of released models")
+    parser.add_argument("--half", action="store_true", help="write weights as float16, half the size")
     args = parser.parse_args()
-    folder = publish(args.checkpoint, args.tag, args.zoo)
+    folder = publish(args.checkpoint, args.tag, args.zoo, half=args.half)
     print(f"{folder}: {', '.join(sorted(file.name for file in folder.iterdir()))}")

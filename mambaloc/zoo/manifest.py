@@ -64,6 +64,7 @@ class Manifest:
         licence: of the weights.
         map_sha256: digest of ``map.safetensors``; None where there is no sparse map.
         map_bytes: its size.
+        weights_dtype: of the weights' file, ``float32`` or ``float16``.
     """
 
     model: str
@@ -78,6 +79,7 @@ class Manifest:
     licence: str
     map_sha256: str | None = None
     map_bytes: int | None = None
+    weights_dtype: str = "float32"
 
     def to_yaml(self) -> str:
         """Write the manifest without fields that are None."""

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from safetensors.torch import save
+from torch import Tensor
 
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.registry import licence_of_weights
@@ -34,7 +35,7 @@ CARD_FILE = "README.md"
 _STARTS = ("backbone_weights", "warm_start")  # the released weights are whole
 
 
-def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
+def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto", half: bool = False) -> Path:
     """Measure a checkpoint, write it as ``ZOO/ARCH.TAG``, and measure again what was written.
 
     Args:
@@ -42,6 +43,7 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
         tag: of the model's name, such as ``7scenes_heads``.
         zoo: the folder that released models are in.
         accelerator: as Lightning's Trainer takes it.
+        half: write weights as float16, half the size; they are float32 again once loaded.
 
     Returns:
         The model's folder; it appears once both measurements agree.
@@ -64,7 +66,7 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
     with whole_folder(folder, "choose another --zoo") as partial:
         if sparse_map is not None:
             shutil.copyfile(sparse_map, partial / MAP_FILE)
-        weights = save({name: tensor.contiguous().cpu() for name, tensor in system.network.state_dict().items()})
+        weights = save({name: _written(tensor, half) for name, tensor in system.network.state_dict().items()})
         manifest = Manifest(
             model=system.registry_name,
             arguments={
@@ -75,6 +77,7 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto") -> Path:
             pose=POSE,
             weights_sha256=hashlib.sha256(weights).hexdigest(),
             weights_bytes=len(weights),
+            weights_dtype="float16" if half else "float32",
             trained=_plain({**checkpoint.provenance, "recipe_sha256": measured["training"]["recipe_sha256"]}),
             results=(_result(measured),),
             licence=licence_of_weights(data.hparams["dataset"]),
@@ -104,7 +107,7 @@ def card(name: str, manifest: Manifest) -> str:
 `mambaloc.load("{name}")`: {manifest.model}, which knows the scene {manifest.scene} and no other.
 
 {manifest.pose}. Images are resized to a short side of {manifest.short_side} pixels and cropped in the middle to
-{width}x{height}. {manifest.weights_bytes / 2**20:.2f} MiB, float32.{_map(manifest)}
+{width}x{height}. {manifest.weights_bytes / 2**20:.2f} MiB, {manifest.weights_dtype}.{_map(manifest)}
 
 | data | epoch | median position | median rotation | seed | training | device | commit |
 |---|---|---|---|---|---|---|---|
@@ -124,6 +127,11 @@ Here with the backbone {manifest.arguments["backbone"]}, GIS: {manifest.argument
 
 {manifest.licence}
 """
+
+
+def _written(tensor: Tensor, half: bool) -> Tensor:
+    tensor = tensor.contiguous().cpu()
+    return tensor.half() if half and tensor.is_floating_point() else tensor
 
 
 def _map(manifest: Manifest) -> str:

@@ -8,24 +8,27 @@ import mambaloc
 from mambaloc.data import PoseDataModule
 from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.metrics import summarize
+from mambaloc.models.registry import model_class
 from mambaloc.zoo import Manifest, list_released
 
 ZOO = Path(__file__).parents[2] / "zoo"
 
 
-NAMES = ["denseloc.embedded_room", "student.embedded_room"]
+NAMES = sorted(path.name for path in ZOO.iterdir() if path.is_dir())
+SHOWN = ("denseloc.embedded_room", "student.embedded_room")  # by the page, and where nothing is named
 
 
-def test_they_are_small():
-    shipped = sorted(path for path in ZOO.iterdir() if path.is_dir())
-    assert [path.name for path in shipped] == NAMES
+def test_every_system_is_released_and_small():
+    ours = [name for name in mambaloc.list_models() if model_class(name).__module__.startswith("mambaloc.")]
+    assert [f"{system}.embedded_room" for system in ours] == NAMES
     assert set(NAMES) <= set(list_released())
-    for folder in shipped:
-        assert sum(file.stat().st_size for file in folder.iterdir()) < 8e6
+    for name in NAMES:
+        assert sum(file.stat().st_size for file in (ZOO / name).iterdir()) < 8e6
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in SHOWN else pytest.mark.nightly) for n in NAMES]
+)
 def test_their_figures_are_found_again(name):
     system, manifest = mambaloc.load(name), Manifest.read(ZOO / name)
     (result,) = manifest.results

@@ -56,6 +56,18 @@ def test_what_is_released_is_what_was_trained(run, released):
     assert system.provenance["commit"] == checkpoint.provenance["commit"]
 
 
+def test_weights_of_half_precision_are_half_as_large(run, released, tmp_path):
+    folder = publish(run / "checkpoints/best.ckpt", "tiny", tmp_path, "cpu", half=True)
+    whole, half = (Manifest.read(each) for each in (released, folder))
+    assert (whole.weights_dtype, half.weights_dtype) == ("float32", "float16")
+    assert half.weights_bytes < 0.6 * whole.weights_bytes
+    assert "float16" in (folder / "README.md").read_text()
+    states = [load(f"local-dir:{each}").network.state_dict() for each in (released, folder)]
+    for name, tensor in states[1].items():
+        assert tensor.dtype == states[0][name].dtype
+        torch.testing.assert_close(tensor, states[0][name], rtol=1e-3, atol=1e-6)
+
+
 def test_every_figure_says_where_it_is_from(released):
     manifest = Manifest.read(released)
     (result,) = manifest.results
