@@ -22,6 +22,7 @@ from mambaloc.data.frame_dataset import CachedFrames
 from mambaloc.data.frames import Frames
 from mambaloc.data.points.depth import depth_rows
 from mambaloc.errors import InputError
+from mambaloc.memory import release_pages
 from mambaloc.runtime.maps.viewpoints import farthest_points, spread_m, viewpoints
 from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
 from mambaloc.synthesis import PosedDepth, carried_depth, depth_from_pictures, without_disagreeing
@@ -115,6 +116,7 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
     kept = [row for row, file in enumerate(files) if file not in rules]
     depth_m = np.stack([known[files[row]] for row in kept])
     source = PosedDepth(data.images[chosen[kept]], depth_m, intrinsics[kept], poses[kept])
+    release_pages(data.images)  # of all frames: those read ahead count, too
     source, off = without_disagreeing(source, [str(files[row]) for row in kept])
     return FoundDepth("sensor", source, lines_of({**rules, **{Path(f): "disagrees with the poses" for f in off}}))
 
