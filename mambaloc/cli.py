@@ -47,7 +47,7 @@ from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.files import read_yaml, writing
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.recipes import recipe_path
-from mambaloc.refusals import OneLineErrorParser, tell_refusals
+from mambaloc.refusals import OneLineErrorParser, report_refusals
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
 _SUBCOMMANDS = ("fit", "validate", "test", "predict")
@@ -294,7 +294,7 @@ def main(argv: list[str] | None = None, began_s: float | None = None) -> RecipeC
     """
     quieten()
     argv = sys.argv[1:] if argv is None else argv
-    with tell_refusals(argv):
+    with report_refusals(argv):
         return RecipeCLI(
             LitPoseRegressor,
             class_from_function(build_data, L.LightningDataModule),

@@ -190,8 +190,8 @@ def head_and_held_out(
 def _trained_on(system: LitPoseRegressor, scenes: int) -> list[str | None]:
     """Digests of each scene's training frames, where the system says them."""
     data = system.provenance.get("data", {})
-    told = list(data["scenes"].values()) if "scenes" in data else [data]
-    digests = [each.get("fingerprints", {}).get("train") for each in told]
+    scenes_data = list(data["scenes"].values()) if "scenes" in data else [data]
+    digests = [each.get("fingerprints", {}).get("train") for each in scenes_data]
     return digests if len(digests) == scenes else [None] * scenes
 
 

@@ -81,11 +81,11 @@ def localize_bag(
                     written += 1
         except KeyboardInterrupt:
             pass
-        said = "; ".join(f"{count} {why}" for why, count in left_out.items())
+        reasons = "; ".join(f"{count} {why}" for why, count in left_out.items())
         if not written:
-            raise InputError(f"{source}: no image of {topic} has a pose to write ({said}). {_REMEDY}")
-    if said:
-        warnings.warn(f"{out}: leaves out {said}.", InputWarning, stacklevel=2)
+            raise InputError(f"{source}: no image of {topic} has a pose to write ({reasons}). {_REMEDY}")
+    if reasons:
+        warnings.warn(f"{out}: leaves out {reasons}.", InputWarning, stacklevel=2)
     return summarize(localizer, found)
 
 
@@ -121,17 +121,17 @@ def _straight(
     bag: Bag, topic: str, straightener: Straightener, intrinsics: ArrayLike | None, left_out: Counter[str]
 ) -> Iterator[tuple[BagImage, Image, ArrayLike | None]]:
     """A topic's whole images as the scene has them, with their intrinsics; None where nothing says them."""
-    told = None if intrinsics is not None else camera_of(bag, topic)
+    camera = None if intrinsics is not None else camera_of(bag, topic)
     made: dict[tuple[int, int], tuple[Matrix, Callable[[Image], Image]]] = {}
     for picture in images_of(bag, topic):
         if isinstance(picture.image, str):
             left_out["that are damaged"] += 1
             continue
-        if told is None:
+        if camera is None:
             yield picture, picture.image, intrinsics
             continue
         size = picture.image.shape[1], picture.image.shape[0]
         if size not in made:
-            made[size] = straightener(told, size)
+            made[size] = straightener(camera, size)
         matrix, straighten = made[size]
         yield picture, straighten(picture.image), matrix

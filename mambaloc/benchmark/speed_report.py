@@ -96,9 +96,9 @@ def print_report(report: SpeedReport, machine: str) -> None:
 
 def write_report(report: SpeedReport, path: Path, machine: str) -> None:
     """Write every figure, and where it comes from, as JSON."""
-    told = {"machine": machine, "versions": provenance.versions(), **asdict(report)}
+    content = {"machine": machine, "versions": provenance.versions(), **asdict(report)}
     with writing(path), whole_file(path) as partial:
-        partial.write_text(json.dumps(told, indent=1, default=str), encoding="utf-8")
+        partial.write_text(json.dumps(content, indent=1, default=str), encoding="utf-8")
 
 
 def print_programs(report: SpeedReport, console: Console) -> None:

@@ -87,11 +87,11 @@ def main() -> None:
         raise InputError(f"{args.source}: is not a ROS bag. Omit --topic, --world-frame and --pose-frame.")
     with _recording(localizer, args.rerun) as recording:
         if is_bag(Path(args.source)):
-            said = _localize_bag(localizer, args, recording)
+            summary = _localize_bag(localizer, args, recording)
         else:
             done = _localize_frames(localizer, args, recording)
-            said = f"{', '.join(map(str, done.files))}: {done}"
-    print(said)
+            summary = f"{', '.join(map(str, done.files))}: {done}"
+    print(summary)
     if args.rerun is not None:
         print(f"{args.rerun}: open it with rerun {args.rerun}")
 
@@ -147,7 +147,7 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
         own = localizer.intrinsics_of((image.shape[1], image.shape[0])) if matrix is None else matrix
         recording.add_frame(image, pose, np.datetime64(picture.ns, "ns"), own)
 
-    said = localize_bag(
+    summary = localize_bag(
         localizer,
         Path(args.source),
         args.out,
@@ -158,7 +158,7 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
         args.pose_frame,
         on_picture=None if recording is None else record,
     )
-    return f"{args.out}: {TOPIC}, {said}"
+    return f"{args.out}: {TOPIC}, {summary}"
 
 
 def _model(name: str | None) -> Path:

@@ -107,8 +107,8 @@ def undistortion_of(folder: Path) -> Undistortion:
     names = {row.camera for row in read_rows(folder) if row.split == "train"}
     if len(names) != 1:
         return Undistortion(unknown=f"they are of {len(names)} cameras")
-    told = read_scene(folder).get("cameras")
-    camera = told.get(*names) if isinstance(told, dict) else None
+    cameras_json = read_scene(folder).get("cameras")
+    camera = cameras_json.get(*names) if isinstance(cameras_json, dict) else None
     if not isinstance(camera, dict):
         return Undistortion(unknown="their scene does not describe their camera")
     if "adjusted_from" in camera:
@@ -133,9 +133,9 @@ def _alike(matrix: Floats, size: Size, frames: Frames) -> Cameras:
     return Cameras(np.tile(matrix, (len(frames), 1, 1)), np.tile(size, (len(frames), 1)))
 
 
-def _of_rendering(folder: Path, told: Any) -> Floats:
+def _of_rendering(folder: Path, intrinsics: Any) -> Floats:
     try:
-        matrix = np.array(told, np.float64)
+        matrix = np.array(intrinsics, np.float64)
     except (ValueError, TypeError):
         matrix = np.empty(0)
     is_pinhole = matrix.shape == (3, 3) and np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0
@@ -172,14 +172,14 @@ def _of_colmap(path: Path, size: Size) -> dict[str, Floats]:
 def _of_capture(folder: Path, frames: Frames) -> Cameras:
     camera_of = {row.image: row.camera for row in read_rows(folder)}
     names = [camera_of[image] for image in frames.image_paths]
-    told = read_scene(folder).get("cameras")
-    cameras = {name: _captured(folder / SCENE_FILE, told, name) for name in {*names}}
+    cameras_json = read_scene(folder).get("cameras")
+    cameras = {name: _captured(folder / SCENE_FILE, cameras_json, name) for name in {*names}}
     return Cameras(np.stack([cameras[name][0] for name in names]), np.array([cameras[name][1] for name in names]))
 
 
-def _captured(path: Path, told: Any, name: str) -> tuple[Floats, Size]:
+def _captured(path: Path, cameras_json: Any, name: str) -> tuple[Floats, Size]:
     """Matrix of a camera of ``scene.json``, and size of its images."""
-    camera = told.get(name) if isinstance(told, dict) else None
+    camera = cameras_json.get(name) if isinstance(cameras_json, dict) else None
     if camera is None or (isinstance(camera, dict) and not {"focal_px", "centre_px"} <= set(camera)):
         raise UnknownCameraError(
             f"{path}: has no focal length and centre of camera {name!r}. Import the scene with its intrinsics, "

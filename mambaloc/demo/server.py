@@ -50,7 +50,7 @@ def serve_page(bundle: Path, film: Path | None, port: int, lan: bool) -> None:
     host = lan_address() if lan else LOOPBACK
     tls = self_signed(host) if lan else None
     code = qr_code if lan else (lambda _: "")
-    code("")  # so that a package that is not there is told before the page is built
+    code("")  # so that a missing package is reported before the page is built
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # as Ctrl-C does, leave nothing behind
     with TemporaryDirectory() as folder:
         site = build_site(bundle, Path(folder, "site"), film)

@@ -49,8 +49,8 @@ def _take(folder: Path) -> None:
     if (taken := int(cv2.VideoCapture(str(folder / VIDEO_FILE)).get(cv2.CAP_PROP_FRAME_COUNT))) != _FRAMES:
         raise InputError(f"{folder.parent}: only {taken} of {_FRAMES} video frames were written. Free some disk space.")
     poses = [[*pose[:3, 3], *quaternion_from_matrix(pose[:3, :3])] for pose in walk]
-    told = {"file": VIDEO_FILE, "fps": _FPS, "poses": np.round(poses, 5).tolist()}
-    (folder / POSES_FILE).write_text(json.dumps(told) + "\n", encoding="utf-8")
+    content = {"file": VIDEO_FILE, "fps": _FPS, "poses": np.round(poses, 5).tolist()}
+    (folder / POSES_FILE).write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 
 @contextmanager

@@ -78,7 +78,7 @@ def draw_sparsity(trained: Sequence[Trained], path: Path, title: str) -> None:
             known[frames] = _points(each, frames)
 
     def draw(axes: Axes, error: str) -> None:
-        plot_errors_by_frames(axes, {name: [told[error] for told in of.values()] for name, of in points.items()})
+        plot_errors_by_frames(axes, {name: [point[error] for point in of.values()] for name, of in points.items()})
         axes.set(xlabel="training frames", ylabel=f"median {_ERRORS[error]}")
         axes.set_ylim(bottom=0)
 

@@ -62,7 +62,7 @@ def evaluate_checkpoint(
             cannot be written.
     """
     if rerun is not None:
-        check_recording(rerun)  # told now rather than once all is computed
+        check_recording(rerun)  # fails now rather than once all is computed
     trained = load_trained(checkpoint, data)
     system, data = trained.system, trained.data
     backbone = _first_backbone(checkpoint) if with_retrieval else None

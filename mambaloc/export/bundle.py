@@ -146,7 +146,7 @@ def _write_models(
         models["int8"] = int8.model
     for name, each in models.items():
         whole = with_preprocessing(each, contract.preprocessing, focal_px) if raw_input else each
-        _tell(whole, contract)
+        _write_metadata(whole, contract)
         onnx.save(whole, folder / MODEL_FILES[name])
     if "ort" in formats:
         write_ort(network, folder / MODEL_FILES["ort"])
@@ -155,7 +155,7 @@ def _write_models(
     return contract, int8
 
 
-def _tell(model: onnx.ModelProto, contract: Contract) -> None:
+def _write_metadata(model: onnx.ModelProto, contract: Contract) -> None:
     del model.metadata_props[:]
     model.metadata_props.add(key=METADATA_KEY, value=contract.to_json())
 
@@ -183,7 +183,7 @@ def _write_frames(
         pictures.append(pictures[0][:, left:])
         cameras = np.concatenate([cameras, cameras[:1] - [[0, 0, left], [0, 0, 0], [0, 0, 0]]])
     (folder / "frames").mkdir()
-    told: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     for number, (rgb, intrinsics) in enumerate(zip(pictures, cameras, strict=True)):
         copy = f"frames/{number}.png"
         (folder / copy).write_bytes(cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
@@ -192,8 +192,8 @@ def _write_frames(
             described["intrinsics"] = intrinsics.tolist()
         if in_map is not None:
             described["map"] = map_vector(in_map, rgb, intrinsics)
-        told.append(described)
-    return told
+        entries.append(described)
+    return entries
 
 
 def _network_vector(

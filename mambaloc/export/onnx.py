@@ -211,8 +211,8 @@ def check_parity(deployed: DeployedNetwork, path: Path, image_size: tuple[int, i
         inputs = _random_inputs(deployed.network, batch, image_size, generator)
         with torch.inference_mode():
             expected_m, expected_q, *expected = deployed(**inputs)
-        said = session.run(None, {name: tensor.numpy() for name, tensor in inputs.items()})
-        actual_m, actual_q, *actual = map(torch.from_numpy, said)
+        outputs = session.run(None, {name: tensor.numpy() for name, tensor in inputs.items()})
+        actual_m, actual_q, *actual = map(torch.from_numpy, outputs)
         position_m.append((actual_m - expected_m).norm(dim=-1).max())
         rotation_deg.append(rotation_error_deg(actual_q, expected_q).max())
         max_norm_m.append(expected_m.norm(dim=-1).max())

@@ -79,15 +79,17 @@ def _stamps(rows: Sequence[Row]) -> Stamps:
 
 def _write_part(folder: Path, scene: Path, frames: Frames, stamps: Stamps, sensors: Sensors) -> None:
     """Write a split as the ``sensors`` of a kapture."""
-    told = _cameras(scene, frames)
-    ids = [sensors.setdefault(each, f"camera-{len(sensors) + 1}") for each in told]
+    of_frames = _cameras(scene, frames)
+    ids = [sensors.setdefault(each, f"camera-{len(sensors) + 1}") for each in of_frames]
     keys = [f"{stamps[image]}, {sensor}" for image, sensor in zip(frames.image_paths, ids, strict=True)]
     names = [image.relative_to(scene).as_posix() for image in frames.image_paths]
     cam_from_world = conjugate(frames.quaternion)
     position = world_of(scene).position_m(frames.position_m)
     translation = -np.einsum("nij,nj->ni", matrix_from_quaternion(cam_from_world), position)
     poses = np.concatenate((cam_from_world, translation), axis=1)
-    cameras = [f"{number}, , camera, {', '.join(each)}" for each, number in dict(zip(told, ids, strict=True)).items()]
+    cameras = [
+        f"{number}, , camera, {', '.join(each)}" for each, number in dict(zip(of_frames, ids, strict=True)).items()
+    ]
     records = [f"{key}, {name}" for key, name in zip(keys, names, strict=True)]
     trajectory = [f"{key}, {_joined(pose)}" for key, pose in zip(keys, poses, strict=True)]
     folder.mkdir(parents=True)

@@ -141,9 +141,9 @@ class Contract:
             intrinsics: (3, 3) pinhole matrix in pixels of the cropped image.
         """
         assert self.intrinsics is not None  # of a model that takes them
-        told = self.preprocessing
+        preprocessing = self.preprocessing
         as_large = round(min(size) * self.intrinsics[0][0] / np.asarray(intrinsics)[0, 0])
-        return replace(told, short_side=min(max(as_large, 1), MOST_ENLARGED * told.short_side))
+        return replace(preprocessing, short_side=min(max(as_large, 1), MOST_ENLARGED * preprocessing.short_side))
 
     def to_json(self) -> str:
         """Write it down, with what its input looks like for those who read no code."""

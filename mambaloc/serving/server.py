@@ -61,13 +61,15 @@ class _Metrics:
 
     def __init__(self, workers: Workers) -> None:
         self.registry = CollectorRegistry()
-        told: dict[str, Any] = {"registry": self.registry, "namespace": "mambaloc"}
-        self.requests = Counter("requests", "Requests to localize, by bundle and status", ("bundle", "status"), **told)
-        self.pictures = Counter("pictures", "Images, by bundle and what answered", ("bundle", "source"), **told)
-        self.seconds = Histogram("picture_seconds", "Of an image, waiting included", ("bundle",), **told)
-        self.waiting = Gauge("pictures_waiting", "Images that are localized or wait for it", **told)
-        Gauge("workers", "Worker processes", **told).set(workers.count)
-        replaced = Gauge("workers_replaced", "Workers that died or took too long", **told)
+        options: dict[str, Any] = {"registry": self.registry, "namespace": "mambaloc"}
+        self.requests = Counter(
+            "requests", "Requests to localize, by bundle and status", ("bundle", "status"), **options
+        )
+        self.pictures = Counter("pictures", "Images, by bundle and what answered", ("bundle", "source"), **options)
+        self.seconds = Histogram("picture_seconds", "Of an image, waiting included", ("bundle",), **options)
+        self.waiting = Gauge("pictures_waiting", "Images that are localized or wait for it", **options)
+        Gauge("workers", "Worker processes", **options).set(workers.count)
+        replaced = Gauge("workers_replaced", "Workers that died or took too long", **options)
         replaced.set_function(lambda: workers.replaced)
 
 
@@ -83,7 +85,7 @@ class _Endpoints:
         try:
             response = JSONResponse(await self._answers(request, name))
         except HTTPException as error:
-            response = await told(request, error)
+            response = await error_response(request, error)
         known = name if name in self.workers.scenes else ""
         self.metrics.requests.labels(known, response.status_code).inc()
         return response
@@ -210,7 +212,7 @@ def create_app(workers: Workers, limits: Limits | None = None, token: str | None
             Route("/metrics", endpoints.prometheus),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)],
-        exception_handlers={HTTPException: told},  # type: ignore[dict-item]
+        exception_handlers={HTTPException: error_response},  # type: ignore[dict-item]
         lifespan=lifespan,
     )
 
@@ -261,7 +263,7 @@ def serve_bundles(
         uvicorn.Server(config).run(sockets=[listening])
 
 
-async def told(request: Request, error: HTTPException) -> JSONResponse:
+async def error_response(request: Request, error: HTTPException) -> JSONResponse:
     """A mistake as JSON."""
     return JSONResponse({"error": error.detail}, error.status_code, error.headers)
 

@@ -171,10 +171,12 @@ def _reached(row: Row, reach_m: float | None) -> str:
         reach_m = retrieval["position_error_m"]
     if reach_m is None or not all(map(history, row.trials)):
         return ""
-    told = [seconds for seconds in row.reached_s(reach_m) if seconds is not None]
-    if not told:
+    reached_s = [seconds for seconds in row.reached_s(reach_m) if seconds is not None]
+    if not reached_s:
         return "never"
-    return _spread(told, 1) + ("" if len(told) == len(row.trials) else f" ({len(told)} of {len(row.trials)} seeds)")
+    return _spread(reached_s, 1) + (
+        "" if len(reached_s) == len(row.trials) else f" ({len(reached_s)} of {len(row.trials)} seeds)"
+    )
 
 
 def _references(rows: Sequence[Row]) -> Section:

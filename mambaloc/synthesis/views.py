@@ -118,8 +118,8 @@ def _name(source: PosedDepth, world_from_cam: Floats, *settings: object) -> str:
     digest = hashlib.sha256(f"{_VERSION} {source.digest()}".encode())
     digest.update(np.ascontiguousarray(world_from_cam, np.float64).tobytes())
     intrinsics, size, seed, spread = settings
-    told = [np.asarray(intrinsics).tolist(), size, seed, astuple(spread)]  # type: ignore[call-overload]
-    digest.update(json.dumps(told).encode())
+    digested = [np.asarray(intrinsics).tolist(), size, seed, astuple(spread)]  # type: ignore[call-overload]
+    digest.update(json.dumps(digested).encode())
     return digest.hexdigest()[:32]
 
 

@@ -157,16 +157,16 @@ def colmap(drawn: Drawn) -> None:
     model = drawn.folder / str(drawn.rng.choice(["sparse", "sparse/0"]))
     if drawn.rng.random() < 0.5:
         name = model.relative_to(drawn.folder).as_posix()
-        told = [f"{number} PINHOLE {w} {h} {line(list(lens))}" for number, w, h, *lens in cameras]
-        drawn.text(f"{name}/cameras.txt", "\n".join(told) + "\n")
+        camera_lines = [f"{number} PINHOLE {w} {h} {line(list(lens))}" for number, w, h, *lens in cameras]
+        drawn.text(f"{name}/cameras.txt", "\n".join(camera_lines) + "\n")
         lines = [f"{number} {line(numbers)} {camera} {file}\n\n" for number, numbers, camera, file in images]
         drawn.text(f"{name}/images.txt", "# Image list\n" + "".join(lines))
         drawn.text(f"{name}/points3D.txt", "")
         return
     model.mkdir(parents=True)
     count = struct.Struct("<Q").pack
-    told_bytes = [struct.pack("<IiQQ4d", number, 1, w, h, *lens) for number, w, h, *lens in cameras]
-    (model / "cameras.bin").write_bytes(count(len(cameras)) + b"".join(told_bytes))
+    camera_records = [struct.pack("<IiQQ4d", number, 1, w, h, *lens) for number, w, h, *lens in cameras]
+    (model / "cameras.bin").write_bytes(count(len(cameras)) + b"".join(camera_records))
     records = [
         struct.pack("<I7dI", number, *numbers, camera) + file.encode() + b"\0" + count(0)
         for number, numbers, camera, file in images
@@ -184,11 +184,11 @@ def polycam(drawn: Drawn) -> None:
         drawn.picture(row, f"keyframes/{prefix}images/{stamp}.jpg")
         width, height = drawn.sizes[row]
         fx, fy, cx, cy = _lens((width, height))
-        told = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
+        camera = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
         for name, off_m in {"cameras": 0.1 if prefix else 0.0, f"{prefix}cameras": 0.0}.items():
             matrix = drawn.matrix(row, GL)
             shifted = {f"t_{i}{j}": matrix[i, j] + off_m * (j == 3) for i in range(3) for j in range(4)}
-            drawn.text(f"keyframes/{name}/{stamp}.json", json.dumps({**told, **shifted}))
+            drawn.text(f"keyframes/{name}/{stamp}.json", json.dumps({**camera, **shifted}))
 
 
 def record3d(drawn: Drawn) -> None:
@@ -202,8 +202,8 @@ def record3d(drawn: Drawn) -> None:
         rows.append([*xyzw, *position])
     width, height = max(drawn.sizes)
     fx, fy, cx, cy = _lens((width, height))
-    told = {"poses": rows, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "w": width, "h": height}
-    drawn.text("metadata", json.dumps(told))
+    metadata = {"poses": rows, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "w": width, "h": height}
+    drawn.text("metadata", json.dumps(metadata))
 
 
 def _lens(size: tuple[int, int]) -> tuple[float, float, float, float]:

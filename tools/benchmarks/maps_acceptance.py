@@ -119,9 +119,9 @@ def _scores(answer: MapLocalization, evidence: Evidence, truth: Floats) -> tuple
     rotation = matrix_from_quaternion(answer.quaternion)
     off = np.concatenate((truth[:3, 3] - answer.position_m, cv2.Rodrigues(truth[:3, :3] @ rotation.T)[0][:, 0]))
     chi2s = [off[:end] @ np.linalg.pinv(answer.covariance[:end, :end]) @ off[:end] for end in (6, 3)]
-    said = (evidence.cells, evidence.deviation, evidence.turn_deg, answer.inliers, answer.is_accepted)
+    scores = (evidence.cells, evidence.deviation, evidence.turn_deg, answer.inliers, answer.is_accepted)
     focal = answer.focal_scale or 0.0
-    return (*said, focal, np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:])), *chi2s)
+    return (*scores, focal, np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:])), *chi2s)
 
 
 def calibrate(folders: Sequence[Path]) -> str:
@@ -135,14 +135,14 @@ def calibrate(folders: Sequence[Path]) -> str:
     """
     of, scene = _read(folders)
     is_wrong = (of["off_m"] > FAR_M) | (of["off_deg"] > FAR_DEG)
-    says = np.isfinite(of["deviation"])
+    has_evidence = np.isfinite(of["deviation"])
     columns = zip(of["cells"], of["deviation"], of["turn_deg"], strict=True)
     evidence = [Evidence(int(cells), *others) for cells, *others in columns]
     known = np.array([each.logarithms() for each in evidence])
     is_asked = of["disturbance"] <= _NAMES.index(_RANDOM)
     group = 100 * scene + of["fold"]
     pictures = np.column_stack((group, of["frame"], of["picture"]))
-    fit = _fit(known[says & is_asked], is_wrong[says & is_asked])
+    fit = _fit(known[has_evidence & is_asked], is_wrong[has_evidence & is_asked])
     lines = [
         "constant, log(cells + 0.5), log(deviation), log(turn + 0.1): " + " ".join(f"{each:.2f}" for each in fit),
         f"{len(np.unique(pictures[:, :2], axis=0))} frames, {len(np.unique(pictures[is_asked], axis=0))} images with "
@@ -150,7 +150,7 @@ def calibrate(folders: Sequence[Path]) -> str:
     ]
     has_matches = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
     can = has_matches & (of["deviation"] <= MOST_DEVIATION)
-    probability = _left_out(known, is_wrong, says, is_asked, group)
+    probability = _left_out(known, is_wrong, has_evidence, is_asked, group)
     chosen = is_asked & _likeliest(pictures, probability)
     is_likely = has_matches & (probability >= LEAST_PROBABILITY)
     for most in _BOUNDS:
@@ -179,12 +179,16 @@ def _thresholds(chosen: NDArray[np.bool_], probability: Floats, is_wrong: NDArra
 
 
 def _left_out(
-    known: Floats, is_wrong: NDArray[np.bool_], says: NDArray[np.bool_], is_asked: NDArray[np.bool_], group: Floats
+    known: Floats,
+    is_wrong: NDArray[np.bool_],
+    has_evidence: NDArray[np.bool_],
+    is_asked: NDArray[np.bool_],
+    group: Floats,
 ) -> Floats:
     """Probabilities by regressions on the other groups; 0 for answers without evidence."""
-    probability = np.zeros(len(says))
+    probability = np.zeros(len(has_evidence))
     for each in np.unique(group):
-        rest, left_out = says & is_asked & (group != each), says & (group == each)
+        rest, left_out = has_evidence & is_asked & (group != each), has_evidence & (group == each)
         probability[left_out] = _probability(_fit(known[rest], is_wrong[rest]), known[left_out])
     return probability
 

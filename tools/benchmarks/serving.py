@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc import provenance
-from mambaloc.benchmark.footprint import said_of
+from mambaloc.benchmark.footprint import proc_value
 from mambaloc.console import OptionParser, exits_cleanly, whole_number
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
@@ -173,7 +173,7 @@ def workers_of(server: int) -> list[int]:
 def resident_mib(process: int) -> float:
     """Resident memory of a process, in MiB; 0 of one that has ended."""
     try:
-        return said_of(Path(f"/proc/{process}/status"), "VmRSS:") / 1024
+        return proc_value(Path(f"/proc/{process}/status"), "VmRSS:") / 1024
     except OSError:
         return 0.0
 

@@ -180,18 +180,18 @@ def _by_spread(
     network: PoseNetwork, networks: list[PoseNetwork], size: tuple[int, int], test: Pictures, there: Pictures
 ) -> list[UncertaintyMethod]:
     """Ways that localize an image several times, and take how far apart the poses are."""
-    told: dict[str, tuple[int, Callable[[Frames], list[PosePrediction]]]] = {
+    methods: dict[str, tuple[int, Callable[[Frames], list[PosePrediction]]]] = {
         "dropout": (PASSES, lambda frames: _dropped_out(network, frames, size)),
         "shifted crops": (5, lambda frames: [_localized(network, frames, size, place) for place in _PLACES]),
     }
     if len(networks) > 1:
-        told[f"ensemble of {len(networks)}"] = (
+        methods[f"ensemble of {len(networks)}"] = (
             len(networks),
             lambda frames: [_localized(each, frames, size) for each in networks],
         )
     ways = [
         UncertaintyMethod(name, passes, *_spreads(poses, test), _spreads(poses, there)[0])
-        for name, (passes, poses) in told.items()
+        for name, (passes, poses) in methods.items()
     ]
     if not network.takes_intrinsics:
         return ways

@@ -85,7 +85,7 @@ def write_certainty(found: Sequence[UncertaintyReport], folder: Path, machine: s
     Raises:
         InputError: where it cannot be written.
     """
-    told = {
+    content = {
         "where": found[0].where,
         "machine": machine,
         "compared": compared(found),
@@ -105,7 +105,7 @@ def write_certainty(found: Sequence[UncertaintyReport], folder: Path, machine: s
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with whole_file(folder / "uncertainty.json") as partial:
-            partial.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+            partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         _draw(found, folder / "uncertainty.png")
 
 

@@ -30,7 +30,7 @@ LONG_SIDE_PX = 640
 """Longest side of the images in which keypoints are searched."""
 
 _NEIGHBOURS = 16  # frames, with another that is turned little and one that is turned more
-_OFFSETS = (32, 24, 16, 12, 8, 6, 4, 3, 2, 1)  # frames from one of a pair to the other; far apart they tell more
+_OFFSETS = (32, 24, 16, 12, 8, 6, 4, 3, 2, 1)  # frames from one of a pair to the other; larger baselines constrain more
 _MOST_TURNS_DEG = (8.0, 15.0)
 _LEAST_MOVE = 0.01  # of the extent; turned on the spot, a camera draws no lines
 _MOST_FRAMES = 32  # that pairs by pose are chosen from

@@ -81,7 +81,7 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
         "direction": "world-to-camera in the file, inverted",
         "scale": "unknown: COLMAP's is arbitrary",
         "origin": "kept",
-        "model": _said(source, models),
+        "model": _model_choice(source, models),
         **found.choices,
         **checked.choices,
     }
@@ -119,7 +119,7 @@ def _used(images: list[Any]) -> list[int]:
     return sorted({image.camera_id for image in images})
 
 
-def _said(source: Path, models: list[Path]) -> str:
+def _model_choice(source: Path, models: list[Path]) -> str:
     """Which model was read, and which were not."""
     first, *others = (model.relative_to(source).as_posix() for model in models)
     if not others:
@@ -170,10 +170,10 @@ def _pinhole(camera: Any) -> tuple[tuple[float, float], tuple[float, float]]:
 
 def _lens(camera: Any) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """The same lens in OpenCV's terms, where it has some; or else pycolmap's, NaN for rays that it does not see."""
-    told = [float(camera.params[at]) for at in camera.extra_params_idxs()]
+    coefficients = [float(camera.params[at]) for at in camera.extra_params_idxs()]
     for model, names in ((OpenCVModel, _OPENCV), (FisheyeModel, _FISHEYES)):
         if camera.model_name in names:
-            return model(*_pinhole(camera), told + [0.0] * (min(model.counts) - len(told)))
+            return model(*_pinhole(camera), coefficients + [0.0] * (min(model.counts) - len(coefficients)))
 
     def distorted(rays: NDArray[np.float64]) -> NDArray[np.float64]:
         points: NDArray[np.float64] = np.column_stack([rays, np.ones(len(rays))])

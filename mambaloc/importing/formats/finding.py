@@ -90,7 +90,7 @@ def find_images(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
         )
     absent = {row: direct[row] or root / path_parts(named[row][0])[-1] for row in lost if files[row] is None}
     every = tuple(file or absent[row] for row, file in enumerate(files))
-    return Found(every, frozenset(absent.values()), _said(root, named, every, [row for row in lost if files[row]]))
+    return Found(every, frozenset(absent.values()), _how_found(root, named, every, [row for row in lost if files[row]]))
 
 
 def count_there(folder: Path, names: Sequence[str]) -> int:
@@ -128,16 +128,17 @@ def _is_possible(root: Path, name: str) -> bool:
     return path_inside(root, longest) is not None
 
 
-def _said(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], moved: Sequence[int]) -> str:
+def _how_found(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], moved: Sequence[int]) -> str:
     """How images were found that are not where their names say."""
     ways: dict[str, list[int]] = {"by the ends of their paths": [], "by their names without suffix": []}
     for row in moved:
         name = path_parts(named[row][0])[-1]
         is_spelled = not _has_suffix(name) or PurePosixPath(name).suffix.lower() == files[row].suffix.lower()
         ways["by the ends of their paths" if is_spelled else "by their names without suffix"].append(row)
-    said = {way: (named[rows[0]][0][-60:], files[rows[0]].relative_to(root)) for way, rows in ways.items() if rows}
+    examples = {way: (named[rows[0]][0][-60:], files[rows[0]].relative_to(root)) for way, rows in ways.items() if rows}
     return "; ".join(
-        f"{len(ways[way])} of {len(named)} {way}: {name!r} is {place.as_posix()}" for way, (name, place) in said.items()
+        f"{len(ways[way])} of {len(named)} {way}: {name!r} is {place.as_posix()}"
+        for way, (name, place) in examples.items()
     )
 
 

@@ -105,9 +105,9 @@ def layout_of(path: Path) -> Layout | None:
     except InputError:
         return None
     first, rest = lines[:_LOOKED_AT], lines[_LOOKED_AT:]  # trackers may have no pose for long
-    said = [line.strip() for line in (*first, *rest[:: 1 + len(rest) // _LOOKED_AT]) if line.strip()]
-    headers = [columns_in(line.lstrip("#% ")) for line in said if line.startswith("#")]
-    rows = [split_line(line) for line in said if not line.startswith("#")]
+    sample = [line.strip() for line in (*first, *rest[:: 1 + len(rest) // _LOOKED_AT]) if line.strip()]
+    headers = [columns_in(line.lstrip("#% ")) for line in sample if line.startswith("#")]
+    rows = [split_line(line) for line in sample if not line.startswith("#")]
     start = next((at for at, (_, words) in enumerate(rows[: _HEADERS + 1]) if as_numbers(words[-7:]) is not None), None)
     if start is None or len(rows) - start < _LEAST_LINES:
         return None

@@ -72,12 +72,12 @@ def read_realityscan(source: Path, images: Path | None = None) -> Capture:
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     table = np.array([numbers for _, _, numbers in rows])
     checked = validate_se3(_world_from_cam(table), lambda row: f"{path}, line {rows[row][0]}")
-    told: dict[tuple[float, ...], str] = {}
+    name_of: dict[tuple[float, ...], str] = {}
     cameras: dict[str, Camera] = {}
     posed = []
     for row, size in zip(there, _sizes([found.files[row] for row in there]), strict=True):
         lens = (*size, *table[row, len(_POSE) - 1 :].tolist())
-        name = told.setdefault(lens, f"camera-{len(told) + 1}")
+        name = name_of.setdefault(lens, f"camera-{len(name_of) + 1}")
         if name not in cameras:
             cameras[name] = _camera(size, lens[2:], f"{path}, line {rows[row][0]}")
         posed.append(Posed(found.files[row], _sequence(found.files[row], folder), checked[row], name))

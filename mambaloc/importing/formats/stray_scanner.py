@@ -21,7 +21,7 @@ from mambaloc.data.depth_frames import read_depth_mm
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, stored_size
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.arkit import told_apart
+from mambaloc.importing.formats.arkit import distinguish_cameras
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole
 from mambaloc.importing.formats.parsing import Table, as_numbers, folder_name, read_text
 from mambaloc.importing.video import chosen_as_stored
@@ -63,7 +63,7 @@ def read_stray_scanner(source: Path) -> Capture:
     images = [film.images[numbers[row]] for row in present]
     size = stored_size(images[0])
     matrix = _camera_matrix(source / _MATRIX)
-    names, cameras = told_apart([_camera(table, row, size, matrix, source) for row in present])
+    names, cameras = distinguish_cameras([_camera(table, row, size, matrix, source) for row in present])
     depth, confidence = (_files_of(source / kind, [numbers[row] for row in present]) for kind in _SENSOR)
     posed = [
         Posed(
@@ -107,8 +107,8 @@ def _depth_choice(depth: Sequence[Path | None], confidence: Sequence[Path | None
     sure = sum(None not in pair for pair in zip(depth, confidence, strict=True))
     if not count:
         return {}
-    said = f"pixels of confidence 0, of 0 to 2, are left out in {sure} of {count} frames" if sure else "all pixels"
-    return {"depth": said}
+    rule = f"pixels of confidence 0, of 0 to 2, are left out in {sure} of {count} frames" if sure else "all pixels"
+    return {"depth": rule}
 
 
 def _odometry(path: Path) -> Table:

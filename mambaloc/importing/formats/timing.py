@@ -57,13 +57,13 @@ class Stamps:
         return f"{self.ns.min() / 1e9:.2f} to {self.ns.max() / 1e9:.2f} s, read as {self.unit}"
 
 
-def stamps_of(words: Sequence[str], like: Stamps | None = None, said: str = "") -> Stamps | None:
+def stamps_of(words: Sequence[str], like: Stamps | None = None, stated_unit: str = "") -> Stamps | None:
     """Times of words, in the unit that fits their size; None where one is not a number.
 
     Args:
         words: as they were written.
         like: other times of the same recording: of units that could be, the one in which both overlap most.
-        said: the unit that a file states; taken where their size allows it.
+        stated_unit: the unit that a file states; taken where their size allows it.
     """
     numbers = [number for word in words if (number := _number(word)) is not None]
     if not numbers or len(numbers) < len(words):
@@ -76,8 +76,8 @@ def stamps_of(words: Sequence[str], like: Stamps | None = None, said: str = "") 
     known = {unit: ns for unit, ns in units.items() if ns is not None}
     if not known:
         return None
-    if said in known:
-        unit = said
+    if stated_unit in known:
+        unit = stated_unit
     else:
         unit = next(iter(known)) if like is None else max(known, key=lambda each: _overlap(known[each], like.ns))
     return Stamps(known[unit], unit)

@@ -87,8 +87,8 @@ class SplitCandidate:
             "how": self.how,
             "frames": self.counts,
             "test_to_nearest_train": {
-                name: dict(zip(("10%", "median", "90%"), (round(each, 5) for each in told), strict=True))
-                for name, told in quantiles.items()
+                name: dict(zip(("10%", "median", "90%"), (round(each, 5) for each in values), strict=True))
+                for name, values in quantiles.items()
             },
             f"within_{NEAR_STEPS:g}_steps": round(self.near, 4),
             "honest": self.is_leak_free,
