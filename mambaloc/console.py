@@ -21,7 +21,7 @@ _as_usual = warnings.formatwarning
 T = TypeVar("T")
 
 
-def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
+def exit_on_input_error(main: Callable[..., Any]) -> Callable[..., Any]:
     """Make a tool's ``main`` print an :class:`InputError` as one line on stderr and exit with code 2.
 
     An :class:`~mambaloc.errors.InputWarning` is one line there, too.
@@ -116,7 +116,7 @@ class _StderrLines(logging.Handler):
         print(self.format(record), file=sys.stderr, flush=True)
 
 
-def quieten() -> None:
+def configure_logging() -> None:
     """Show the package's own log, and of libraries only what a user can act on: no hardware lists, no tips."""
     threading.excepthook = _show_unless_of_the_disk
     own = logging.getLogger("mambaloc")

@@ -119,7 +119,7 @@ def writing(folder: Path, remedy: str = "choose another folder with --out") -> I
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """Give a file beside a path to write to, which gets its name once the block ends; an error leaves nothing."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # nobody else's
     try:
@@ -130,7 +130,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
+def atomic_folder(folder: Path, remedy: str) -> Iterator[Path]:
     """Give an empty folder to write to, which gets its name once the block ends; an error leaves nothing.
 
     Args:

@@ -19,7 +19,7 @@ from rich.progress import track
 
 from mambaloc.benchmark.clock import now
 from mambaloc.benchmark.setting import BenchmarkConfig
-from mambaloc.console import quieten
+from mambaloc.console import configure_logging
 
 Measured = TypeVar("Measured")
 
@@ -69,7 +69,7 @@ def exponent(frames: Sequence[int], costs: Sequence[float]) -> float:
 
 def in_a_process(measure: Callable[..., Measured], *args: Any) -> Measured:
     """Run a measurement in a new process, which begins with none of this one's memory."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=quieten) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=configure_logging) as pool:
         return pool.submit(measure, *args).result()
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from mambaloc.bags.images import BagImage
 from mambaloc.bags.reading import is_bag
 from mambaloc.bags.writing import TOPIC
-from mambaloc.console import OptionParser, black_and_white, exits_cleanly, pinhole_matrix, thread_count
+from mambaloc.console import OptionParser, black_and_white, exit_on_input_error, pinhole_matrix, thread_count
 from mambaloc.errors import InputError
 from mambaloc.images import Image
 from mambaloc.runtime import Localizer
@@ -21,7 +21,7 @@ from mambaloc.runtime.video import FILTERS, VideoResult, localize_video
 from mambaloc.viz.rerun_recording import RerunRecording, rerun_recording
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Localize every frame and write a trajectory; Ctrl-C ends a camera's."""
     parser = OptionParser(description=__doc__)

@@ -14,7 +14,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, pinhole_matrix, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, pinhole_matrix, whole_number
 from mambaloc.errors import InputError
 from mambaloc.mapping import MapSettings
 from mambaloc.mapping.building import POINTS, describe_points
@@ -28,10 +28,10 @@ from mambaloc.viz.coverage import write_coverage
 from mambaloc.viz.matches import write_points
 
 
-@exits_cleanly
+@exit_on_input_error
 def main(argv: list[str] | None = None) -> None:
     """Write map.safetensors, coverage.png, and what the map does on test frames."""
-    quieten()
+    configure_logging()
     args = _parser().parse_args(argv)
     of_added = {"name": args.name, "intrinsics": args.intrinsics is not None, "distorted": args.distorted}
     if not args.add and any(of_added.values()):

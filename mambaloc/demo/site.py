@@ -15,9 +15,9 @@ from rich.console import Console
 
 from mambaloc.demo.video import POSES_FILE, VIDEO_FILE
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.runtime.bundle import CONTRACT_FILE, verify_bundle
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 _WEB = files("mambaloc.demo") / "web"
 _VENDORED = "vendor.json"  # the site's files that come from npm, and where they lie in node_modules
@@ -39,7 +39,7 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
     if out.exists():
         raise InputError(f"{out}: already exists; choose another folder with --out, or remove it")
     modules = node_modules()
-    with whole_folder(out, "choose another folder with --out") as site:
+    with atomic_folder(out, "choose another folder with --out") as site:
         with as_file(_WEB) as web:
             shutil.copytree(web, site, dirs_exist_ok=True, ignore=shutil.ignore_patterns(_VENDORED, *_NPM_FILES))
         for name, source in json.loads((_WEB / _VENDORED).read_text(encoding="utf-8")).items():
@@ -63,7 +63,7 @@ def node_modules(dev: bool = False) -> Path:
     """
     lock = (_WEB / "package-lock.json").read_bytes()
     name = hashlib.sha256(lock).hexdigest()[:12] + ("-dev" if dev else "")
-    return made_once(f"node/{name}", partial(_install, dev=dev)) / "node_modules"
+    return cached_folder(f"node/{name}", partial(_install, dev=dev)) / "node_modules"
 
 
 def _install(folder: Path, dev: bool) -> None:

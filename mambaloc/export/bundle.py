@@ -24,7 +24,7 @@ from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.export.quantization import QuantizedModel, eight_bit
-from mambaloc.files import sha256, whole_folder
+from mambaloc.files import atomic_folder, sha256
 from mambaloc.geometry import canonical
 from mambaloc.images import Image, read_image
 from mambaloc.models import LitPoseRegressor
@@ -91,7 +91,7 @@ def write_bundle(
         raise InputError(f"{what}, and this network knows {len(scenes)}. Leave it out.")
     data.setup("test")
     status = Console(stderr=True).status(f"exporting {system.registry_name}")
-    with status, whole_folder(out, "choose another folder with --out") as partial:
+    with status, atomic_folder(out, "choose another folder with --out") as partial:
         try:
             uncertainty, unsure = fit_uncertainty(system, data), None
         except InputError as error:

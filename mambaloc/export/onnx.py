@@ -21,7 +21,7 @@ from typing_extensions import deprecated
 
 from mambaloc.data import MultiSceneDataModule, PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork, PositionScale
@@ -119,7 +119,7 @@ def export_onnx(
         InputError: where ONNX Runtime disagrees with PyTorch, or the file cannot be written.
     """
     deployed = DeployedNetwork(copy.deepcopy(system.network).cpu().float(), uncertainty).eval()
-    with writing(path, "choose another folder"), whole_file(path) as partial:
+    with writing(path, "choose another folder"), atomic_file(path) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(deployed, contract, partial)
         parity = check_parity(deployed, partial, system.image_size)

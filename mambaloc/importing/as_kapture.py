@@ -18,7 +18,7 @@ from mambaloc.data.cameras import UnknownCameraError, known_cameras
 from mambaloc.data.datasets.capture import CAPTURE, Row, read_rows, read_scene, read_split, world_of
 from mambaloc.data.frames import BadFrames, Frames
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.images import CORNER_PX, stored_size
 from mambaloc.importing.formats.kapture import SPLITS
 from mambaloc.runtime.rotations import conjugate, matrix_from_quaternion
@@ -60,7 +60,7 @@ def write_kapture(scene: Path, out: Path) -> tuple[dict[str, int], int]:
         raise InputError(f"{bad}: has a comma in its path, which kapture reads as the end of a value. Rename it.")
     stamps, sensors = _stamps(rows), Sensors()
     counts = {}
-    with whole_folder(out, "choose another folder with --out") as partial:
+    with atomic_folder(out, "choose another folder with --out") as partial:
         for name, split in used.items():
             frames = read_split(scene, split, BadFrames())
             _write_part(partial / name / "sensors", scene, frames, stamps, sensors)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.importing.canonical import Imported, write_frames, write_scene
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks import sanity
@@ -66,7 +66,7 @@ def import_scene(
     capture = read_capture(source, kind, images, topics)
     named = capture.left_out
     capture, lost = in_its_world(capture, metres_per_unit)
-    with whole_folder(out, "choose another folder with --out") as partial:
+    with atomic_folder(out, "choose another folder with --out") as partial:
         written = write_images(capture, partial)
         imported = _checked(written, {**named, **lost, **written.rules}, split, with_adjusted)
         write_frames(imported, partial)

@@ -14,7 +14,7 @@ from rich.progress import track
 
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.runtime.sources import SourceFrame, frames_of
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
 """Suffixes of files that are taken for videos."""
@@ -42,7 +42,7 @@ def chosen_as_stored(film: Path) -> VideoFrames:
     Raises:
         InputError: where the video cannot be opened, or the cache not be written.
     """
-    folder = made_once(f"films/{digest_of([film], _VERSION)}", lambda partial: _write_chosen(film, partial))
+    folder = cached_folder(f"films/{digest_of([film], _VERSION)}", lambda partial: _write_chosen(film, partial))
     images = {int(path.stem): path for path in sorted(folder.glob("*.jpg"))}
     return VideoFrames(images, json.loads((folder / _NOTE).read_text(encoding="utf-8"))["count"])
 

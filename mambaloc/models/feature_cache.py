@@ -18,7 +18,7 @@ from mambaloc.files import claim_space
 from mambaloc.memory import release_pages
 from mambaloc.nn import SplitBackbone
 from mambaloc.types import PoseBatch
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 _REMEDY = "make room, set MAMBALOC_CACHE elsewhere, or set model.feature_cache_gib to 0"
 
@@ -62,7 +62,7 @@ class FeatureCache:
             _make_file(empty / "features.npy", np.float16, (room, sum(self._sizes)))
             _make_file(empty / "is_kept.npy", np.bool_, (room,))
 
-        folder = made_once(f"features/{name}", make, cache_dir, _REMEDY)
+        folder = cached_folder(f"features/{name}", make, cache_dir, _REMEDY)
         self.features, self.is_kept = (
             np.load(folder / f"{file}.npy", mmap_mode="r+") for file in ("features", "is_kept")
         )

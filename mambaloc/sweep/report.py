@@ -8,7 +8,7 @@ from statistics import geometric_mean, mean, stdev
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import BLOCK, LEVEL
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.sweep.formats import Section, as_csv, as_latex, as_markdown, as_page, as_svg
 from mambaloc.sweep.paper import paper_tables
 from mambaloc.sweep.plots import NAMES, plots_of
@@ -60,7 +60,7 @@ def write_report(
     ]
     if failed:
         sections.append(_failures(failed))
-    with whole_folder(out, "choose another folder with --out") as folder:
+    with atomic_folder(out, "choose another folder with --out") as folder:
         _write(folder, _introduction(rows, failed), sections)
     return rows, failed
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mambaloc.console import progress
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.memory import release_pages
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 from mambaloc.synthesis.sampling import PoseSampler, Spread
@@ -157,13 +157,13 @@ def supported(
 
 
 def _write(folder: Path, views: Views) -> None:
-    with whole_folder(folder, _REMEDY) as partial:
+    with atomic_folder(folder, _REMEDY) as partial:
         for name in _FIELDS:
             np.save(partial / f"{name}.npy", getattr(views, name))
 
 
 def _join(parts: list[Path], count: int, folder: Path) -> None:
-    with whole_folder(folder, _REMEDY) as partial:
+    with atomic_folder(folder, _REMEDY) as partial:
         for name in _FIELDS:
             first = np.load(parts[0] / f"{name}.npy", mmap_mode="r")
             joined = np.lib.format.open_memmap(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file
+from mambaloc.files import atomic_file
 from mambaloc.geometry import matrix_from_quaternion
 from mambaloc.metrics import PoseErrorTable
 from mambaloc.viz.trajectory import TRUE_COLOR, box_around, means, medians
@@ -63,7 +63,7 @@ def write_scene_page(
     summary = f"{medians(table)}; {means(table)}; {len(index)} frames"
     heading, *details = title.split("\n")
     page = _PAGE.substitute(title=html.escape(heading), summary=html.escape("; ".join((*details, summary))), plot=plot)
-    with whole_file(path) as partial:
+    with atomic_file(path) as partial:
         partial.write_text(page, encoding="utf-8")
 
 

@@ -35,7 +35,7 @@ def room():
 
 
 @pytest.fixture(scope="session")
-def room_with_depth(made_once):
+def room_with_depth(shared_folder):
     """A root with one scene, the embedded room: 40 training, 12 validation, 8 test frames, every other with depth."""
 
     def write(root):
@@ -43,13 +43,13 @@ def room_with_depth(made_once):
         shots = frames_of_sequences(walks, {3})
         write_7scenes(root, "room", shots, room=embedded_room(), size=SIZE, depth=True, depth_every=2)
 
-    return made_once("room_with_depth", write)
+    return shared_folder("room_with_depth", write)
 
 
 @pytest.fixture(scope="session")
-def view_cache(made_once):
+def view_cache(shared_folder):
     """A cache of the session, so that a set of views is made once."""
-    return made_once("view_cache", lambda folder: None)
+    return shared_folder("view_cache", lambda folder: None)
 
 
 @pytest.fixture(autouse=True)

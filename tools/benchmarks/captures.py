@@ -14,13 +14,13 @@ from pathlib import Path
 
 from captures_read import count_one
 
-from mambaloc.console import OptionParser, exits_cleanly
+from mambaloc.console import OptionParser, exit_on_input_error
 
 COUNTED = ("captures", "refused", "tracebacks", "should", "read", "equal", "silent")
 """Captures, and frames: that should be read, that were, with their true pose, and with another or none."""
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Print counts by kind and in all, and what was refused."""
     parser = OptionParser(description=__doc__)

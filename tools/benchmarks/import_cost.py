@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 
 _HERE = Path(__file__).parents[2]
@@ -32,7 +32,7 @@ Cost = tuple[float, float, float]
 """Seconds computed, seconds passed, and the largest resident memory in MiB."""
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Print the medians of each layout and checkout, and this checkout's share of each other's."""
     parser = OptionParser(description=__doc__.splitlines()[0])

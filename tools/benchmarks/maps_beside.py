@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.images import read_image
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.recipe import MapRecipe
@@ -93,7 +93,7 @@ def measure_beside_colmap(recipe: MapRecipe, hold_out: str | None, out: Path) ->
     }
     text = _table(result)
     for name, content in (("colmap.json", json.dumps(result, indent=2) + "\n"), ("colmap.md", text)):
-        with writing(out), whole_file(out / name) as partial:
+        with writing(out), atomic_file(out / name) as partial:
             partial.write_text(content, encoding="utf-8")
     return text
 

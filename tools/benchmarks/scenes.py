@@ -17,7 +17,7 @@ from rich.progress import track
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process, peak_bytes
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.registry import DATASETS, scene_folder
 from mambaloc.data.frames import BadFrames, Split
@@ -63,10 +63,10 @@ class SceneCost:
         return self.listed["train"], self.listed["test"]
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure scenes and print."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument("root", type=Path, help="folder that holds them")
     parser.add_argument("scenes", nargs="*", help="names; every official one that is there unless given")

@@ -28,7 +28,7 @@ import numpy as np
 
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import proc_value
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
 from mambaloc.runtime import Localizer
@@ -55,7 +55,7 @@ class Load:
     status: Counter[int]
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure and print."""
     parser = OptionParser(description=__doc__)

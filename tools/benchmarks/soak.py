@@ -23,7 +23,7 @@ from rich.console import Console
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import STATUS, proc_value
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 from mambaloc.files import writing
 from mambaloc.viz.curves import COLORS, finish
@@ -63,10 +63,10 @@ class Sample:
     threads: int
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Train, print and draw."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument("recipes", type=Path, nargs="+", help="a recipe, and overlays")
     parser.add_argument("--steps", type=whole_number(1), default=10_000)

@@ -20,7 +20,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.sfm.process import Job
@@ -37,7 +37,7 @@ _NEIGHBOURS = 10  # of a video's frame that it is matched with, as the import ha
 _INSIDE_M = ((-1.25, -1.0, 1.1), (1.25, 1.0, 1.7))
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Print CPU seconds of each step, and the errors of both mappers."""
     parser = OptionParser(description=__doc__.splitlines()[0])

@@ -28,9 +28,9 @@ from rich.table import Table
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.mapping.building import build_map
 from mambaloc.mapping.evaluating import measure
 from mambaloc.mapping.keyframes import farthest_first
@@ -79,10 +79,10 @@ class Way:
 REACH = (Errors(0.2, 6), Errors(0.19, 6.3), Errors(0.1, 3), Errors(0.05, 2))
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure each way, print the table, and write every figure to ``time_to_accuracy.json``."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("sweep", type=Path, help="of trainings, as recipes/sweeps/ holds them")
     parser.add_argument("--map", type=Path, help="recipe of a map, to measure beside pycolmap's route")
@@ -98,7 +98,7 @@ def main() -> None:
         raise InputError(f"--{'frames' if args.frames else 'width'}: is of a map. Give its recipe with --map.")
     if recipe:
         recipe = replace(recipe, settings=replace(recipe.settings, **given))
-    with whole_folder(args.out, "choose another folder with --out") as folder:
+    with atomic_folder(args.out, "choose another folder with --out") as folder:
         ways = [measure_training(trial, folder, sweep.time_limit_s, sweep.cpus) for trial in sweep.trials]
         if recipe:
             ways += measure_maps(recipe)

@@ -25,7 +25,7 @@ from uncertainty_methods import (
 )
 
 from mambaloc.benchmark.report import new_table
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.viz.curves import COLORS, finish
 from mambaloc.viz.png import write_png
 
@@ -104,7 +104,7 @@ def write_certainty(found: Sequence[UncertaintyReport], folder: Path, machine: s
     }
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(folder / "uncertainty.json") as partial:
+        with atomic_file(folder / "uncertainty.json") as partial:
             partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         _draw(found, folder / "uncertainty.png")
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from mambaloc import provenance
-from mambaloc.console import OptionParser, exits_cleanly, quieten
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error
 from mambaloc.data.depth_frames import NO_DEPTH_MM, depth_path, read_depth_intrinsics, read_depth_mm
 from mambaloc.images import read_image, resized
 from mambaloc.mapping import PosedFrames
@@ -40,10 +40,10 @@ from mambaloc.viz.views import draw_views
 _VIEWS = 512
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure a scene, print, and draw a contact sheet for each kind of depth."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument("--root", default="../shared/data/7scenes_blocks")
     parser.add_argument("--scene", default="redkitchen")

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.data.depth_frames import NO_DEPTH_MM, read_depth_mm, read_whole_png
+from mambaloc.data.depth_frames import NO_DEPTH_MM, read_complete_png, read_depth_mm
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture, Depth
 from mambaloc.importing.checks.epipolar import apart_of
@@ -133,7 +133,7 @@ def _confidence(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     Raises:
         InputError: where it is not a whole PNG of 8 bits and that shape.
     """
-    found = read_whole_png(path)
+    found = read_complete_png(path)
     if found is None or found.dtype != np.uint8 or found.shape != shape:
         raise InputError(
             f"{path}: is not a complete 8-bit PNG of one channel and the size of its depth frame, "

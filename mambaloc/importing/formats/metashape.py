@@ -142,8 +142,8 @@ def _to_world(path: Path, transform: Element, poses: Matrices) -> Matrices:
     """Poses in a chunk as ``world_from_cam``."""
     parts = [_numbers(transform, name) for name in ("rotation", "translation", "scale")]
     rotation, translation, scale = (np.zeros(0) if each is None else each for each in parts)
-    is_whole = (len(rotation), len(translation), len(scale)) == (9, 3, 1)
-    if not is_whole or not np.isfinite([*translation, *scale]).all() or not 1e-9 < scale[0] < 1e9:
+    is_complete = (len(rotation), len(translation), len(scale)) == (9, 3, 1)
+    if not is_complete or not np.isfinite([*translation, *scale]).all() or not 1e-9 < scale[0] < 1e9:
         raise InputError(f"{path}: the chunk's transform is not a rotation, translation and scale; export it again")
     matrix = np.c_[rotation.reshape(3, 3), translation]
     (turned,) = validate_se3(matrix[None], lambda _: f"{path}: the chunk's transform").poses

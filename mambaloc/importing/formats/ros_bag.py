@@ -35,7 +35,7 @@ from mambaloc.importing.video import digest_of
 from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 from mambaloc.runtime.sources import SourceFrame
 from mambaloc.runtime.undistortion import undistorted
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 _VERSION = 1  # of what is kept; another one is made again
 _NOTE, _POSES = "note.json", "poses.npy"
@@ -79,7 +79,7 @@ def read_ros_bag(source: Path, topics: BagTopics | None = None) -> Capture:
         topic = image_topic(bag, asked.pictures)
         camera_info = camera_of(bag, topic)
         digest = digest_of(_files(source), _VERSION, topic, asked.poses, asked.pose_frame)
-        folder = made_once(f"bags/{digest}", lambda partial: _write_chosen(bag, topic, asked, partial))
+        folder = cached_folder(f"bags/{digest}", lambda partial: _write_chosen(bag, topic, asked, partial))
     note, poses = json.loads((folder / _NOTE).read_text(encoding="utf-8")), np.load(folder / _POSES)
     if note["gaps"]:
         warnings.warn(f"{source}: {note['gaps']}.", InputWarning, stacklevel=2)

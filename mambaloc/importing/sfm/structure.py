@@ -28,7 +28,7 @@ from mambaloc.importing.sfm.unread import pose_like, warning_of
 from mambaloc.importing.undistort.decoding import choices_of, counts_of
 from mambaloc.importing.video import VIDEO_SUFFIXES, Counted, digest_of, write_frames
 from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 _NEIGHBOURS = 10  # before and after a video's frame that it is matched with, beside those 2, 4, 8, ... apart
 _VERSION = 1  # of what is kept: another one is made again
@@ -67,7 +67,7 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
         console.print(f"{source}: {warning_of(unread)}", markup=False, soft_wrap=True)
     source = source if source.is_file() else first_with_images([source, source / "images"])
     digest = digest_of([source] if source.is_file() else list_images(source), _VERSION, seed)
-    folder = made_once(f"structure/{digest}", lambda partial: _make(source, partial, threads, seed))
+    folder = cached_folder(f"structure/{digest}", lambda partial: _make(source, partial, threads, seed))
     note = json.loads((folder / "note.json").read_text(encoding="utf-8"))
     capture = read_colmap(folder)
     placed = set(capture.images)

@@ -63,7 +63,7 @@ class _Advisor:
 
     def given(self) -> SplitCandidate | None:
         split = np.array(self.capture.split if self.capture.split is not None else (), dtype="<U6")
-        if not _is_whole(split):
+        if not _is_complete(split):
             return None
         return self.with_validation(self._measured("given", "as the capture's own files have it", split))
 
@@ -144,7 +144,7 @@ class _Advisor:
                 steps = self.motion.steps(length, turn_deg)
                 near |= (steps <= NEAR_STEPS).any(axis=0)
             sparse[rows[near & (split[rows] == "train")]] = "unused"
-        return sparse if _is_whole(sparse) else split
+        return sparse if _is_complete(sparse) else split
 
     def with_validation(self, proposal: SplitCandidate) -> SplitCandidate:
         """Mark training frames for validation: a block, after a gap, or a recording.
@@ -228,7 +228,7 @@ class _Advisor:
         return measured(kind, how, split, self.capture, self.motion)
 
 
-def _is_whole(split: NDArray[np.str_]) -> bool:
+def _is_complete(split: NDArray[np.str_]) -> bool:
     return {"train", "test"} <= set(split.tolist())
 
 

@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.runtime.maps.acceptance import RULE
 from mambaloc.runtime.maps.drift import NUGGET
@@ -131,7 +131,7 @@ class SparseMap:
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         with writing(path, "free some space, or choose another folder"):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(path) as partial:
+            with atomic_file(path) as partial:
                 partial.write_bytes(save(whole, {"about": json.dumps(about)}))
 
     @classmethod
