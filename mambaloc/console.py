@@ -65,12 +65,12 @@ class OptionParser(argparse.ArgumentParser):
         raise InputError(f"{message.removeprefix('argument ')}; --help lists the options")
 
 
-def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+def whole_number(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
     """Make a reader of an option's whole number within bounds, for :mod:`argparse`."""
 
     def read(text: str) -> int:
-        if not text.isdecimal() or not least <= int(text) <= (int(text) if most is None else most):
-            bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
+        if not text.isdecimal() or not minimum <= int(text) <= (int(text) if maximum is None else maximum):
+            bounds = f"of at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
             raise argparse.ArgumentTypeError(f"{text}: give a whole number {bounds}")
         return int(text)
 

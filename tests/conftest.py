@@ -25,7 +25,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
-    """``shared_folder(name, make)``: the folder of that name, which ``make(folder)`` fills once for all xdist workers."""
+    """``shared_folder(name, make)``: the folder of a name, which ``make(folder)`` fills once for all xdist workers."""
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
     shared.mkdir(exist_ok=True)

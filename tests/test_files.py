@@ -128,6 +128,6 @@ def test_what_is_no_json(content, message, tmp_path):
 def test_json_that_is_too_large(tmp_path, monkeypatch):
     (tmp_path / "a.json").write_text("[1, 2, 3]")
     assert read_json(tmp_path / "a.json", "add it", "repair it") == [1, 2, 3]
-    monkeypatch.setattr("mambaloc.files._MOST_JSON_BYTES", 5)
+    monkeypatch.setattr("mambaloc.files._MAX_JSON_BYTES", 5)
     with pytest.raises(InputError, match="larger than 5 bytes; repair it"):
         read_json(tmp_path / "a.json", "add it", "repair it")

@@ -22,7 +22,7 @@ from mambaloc.mapping.evaluating import Making, build_and_measure, measure, meas
 from mambaloc.mapping.growing import add_frames, remove_session
 from mambaloc.mapping.new_frames import read_new_frames
 from mambaloc.mapping.posed import read_frames
-from mambaloc.mapping.recipe import LEAST, recipe_of
+from mambaloc.mapping.recipe import MINIMUM, recipe_of
 from mambaloc.runtime.maps import MAP_FILE, MapLocalizer, SparseMap
 from mambaloc.viz.coverage import write_coverage
 from mambaloc.viz.matches import write_points
@@ -104,12 +104,12 @@ def _parser() -> OptionParser:
     )
     parser.add_argument(
         "--frames",
-        type=whole_number(LEAST["key_frames"]),
+        type=whole_number(MINIMUM["key_frames"]),
         help="number of key frames among the training or added frames (default: 160)",
     )
     parser.add_argument(
         "--width",
-        type=whole_number(LEAST["width"]),
+        type=whole_number(MINIMUM["width"]),
         help="width in pixels at which keypoints are searched; narrower images keep their size",
     )
     parser.add_argument(

@@ -108,9 +108,9 @@ class Frames:
         """Rows by the name that a model in the scene's folder knows the images by: :func:`plain_name` of their path."""
         return {plain_name(path.relative_to(folder).as_posix()): row for row, path in enumerate(self.image_paths)}
 
-    def evenly_spread(self, most: int) -> list[int]:
+    def evenly_spread(self, count: int) -> list[int]:
         """Indices of at most so many frames, evenly spread from the first to the last."""
-        return np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int).tolist()
+        return np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int).tolist()
 
     def by_sequence(self) -> dict[str, NDArray[np.int64]]:
         """Indices of each sequence's frames, in order of first appearance."""

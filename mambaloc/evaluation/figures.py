@@ -22,7 +22,7 @@ from mambaloc.viz.scene_page import write_scene_page
 from mambaloc.viz.top_view import draw_top_view
 from mambaloc.viz.trajectory import draw_trajectory
 
-MOST_FRAMES = 12
+MAX_FRAMES = 12
 """Frames side by side in one figure."""
 
 _OUTDOORS = {"cambridge"}
@@ -44,8 +44,8 @@ def draw_figures(kind: str, trained: Sequence[Trained], out: Path, frames: int =
         InputError: for frames that are not there, systems that do not go into one figure, or a folder that cannot be
             written.
     """
-    if not 1 <= frames <= MOST_FRAMES:
-        raise InputError(f"--frames {frames}: must be 1 to {MOST_FRAMES}")
+    if not 1 <= frames <= MAX_FRAMES:
+        raise InputError(f"--frames {frames}: must be 1 to {MAX_FRAMES}")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)  # fails now rather than once all is computed
     return FIGURES[kind](trained, out, frames)

@@ -24,7 +24,7 @@ from mambaloc.importing.splits.selection import ASKED, SelectedSplit, SplitCandi
 from mambaloc.importing.undistort.images import Written, write_images
 from mambaloc.importing.world import in_its_world
 
-_MOST_SCALE = 1e6
+_MAX_SCALE = 1e6
 
 
 def import_scene(
@@ -59,9 +59,9 @@ def import_scene(
         raise InputError(f"{out}: already exists; remove it, or choose another --out")
     if split not in ASKED:
         raise InputError(f"--split {split}: choose one of {', '.join(ASKED)}")
-    if metres_per_unit is not None and not 1 / _MOST_SCALE <= metres_per_unit <= _MOST_SCALE:
+    if metres_per_unit is not None and not 1 / _MAX_SCALE <= metres_per_unit <= _MAX_SCALE:
         raise InputError(
-            f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
+            f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MAX_SCALE:g} to {_MAX_SCALE:g}"
         )
     capture = read_capture(source, kind, images, topics)
     named = capture.left_out

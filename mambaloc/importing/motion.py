@@ -17,8 +17,8 @@ _JUMP_STEPS = 10.0
 _JUMP_SHARE = 0.02  # of the extent: a camera that hardly moves makes no jumps
 _JUMP_DEG = 45.0
 _LONGEST_STEP = 0.25  # of the extent: a path's steps are shorter; two frames drawn at random lie farther apart
-_LEAST_STEP = 1e-4  # of the extent
-_LEAST_DEG = 0.05
+_MIN_STEP = 1e-4  # of the extent
+_MIN_DEG = 0.05
 _PAIRS_AT_ONCE = 1 << 20
 
 
@@ -72,8 +72,8 @@ def motion_of(capture: Capture) -> Motion:
         length,
         turn_deg,
         extent,
-        max(step, _LEAST_STEP * extent, 1e-12),
-        max(step_deg, _LEAST_DEG),
+        max(step, _MIN_STEP * extent, 1e-12),
+        max(step_deg, _MIN_DEG),
         in_order,
         later[jumps] if in_order else later[:0],
     )

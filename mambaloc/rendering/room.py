@@ -28,7 +28,7 @@ from mambaloc.rendering.textures import (
 
 MARGIN_M = 1.2  # from the camera's box to the walls: deeper than any piece of furniture
 BELOW_M, ABOVE_M = 1.05, 0.9  # from the camera's box to the floor, which low tables fit under, and to the ceiling
-LEAST_HEIGHT_M = 2.5
+MIN_HEIGHT_M = 2.5
 _WIDEST_BOX_M = 3.5  # a larger camera box gets the room of a smaller one, scaled up
 
 
@@ -42,7 +42,7 @@ def furnished_room(inside_m: ArrayLike, seed: int, px_per_m: float = 280) -> Roo
     """
     lower, upper = np.asarray(inside_m, dtype=float)
     length, width, height = upper - lower + (2 * MARGIN_M, 2 * MARGIN_M, BELOW_M + ABOVE_M)
-    height = max(height, LEAST_HEIGHT_M)
+    height = max(height, MIN_HEIGHT_M)
     paint = Paint(np.random.default_rng(seed), px_per_m)
 
     quads = [*_ceiling(paint, length, width, height), _floor(paint, length, width)]

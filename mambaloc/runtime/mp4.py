@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-_MOST_BYTES = 1 << 26  # of moov: tables of hours
+_MAX_BYTES = 1 << 26  # of moov: tables of hours
 _HDR = {16: "PQ", 18: "HLG"}
 
 
@@ -55,7 +55,7 @@ def _moov(path: Path) -> bytes:
             if length == 1:
                 (length,), skip = struct.unpack_from(">Q", head, 8), 16
             length = size - at if length == 0 else length
-            if kind == b"moov" and length <= _MOST_BYTES:
+            if kind == b"moov" and length <= _MAX_BYTES:
                 file.seek(at + skip)
                 return file.read(length - skip)
             if length < 8:

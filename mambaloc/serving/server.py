@@ -157,8 +157,8 @@ class _Endpoints:
         async for chunk in request.stream():
             size += len(chunk)
             if size > self.limits.body_bytes:
-                most = self.limits.body_bytes / 2**20
-                raise HTTPException(413, f"body: is larger than {most:g} MiB. Give smaller images, or fewer.")
+                max_mib = self.limits.body_bytes / 2**20
+                raise HTTPException(413, f"body: is larger than {max_mib:g} MiB. Give smaller images, or fewer.")
             yield chunk
 
     async def _localized(self, task: Task) -> Answer:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mambaloc.sweep.summary import ERRORS, Row, history
-from mambaloc.viz.curves import COLORS, Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
+from mambaloc.viz.curves import COLORS, Point, axis_limit, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
 
 NAMES = {"position_error_m": "median position (m)", "rotation_error_deg": "median rotation (°)"}
 
@@ -56,13 +56,13 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
     errors_m = (
         np.array(trial["frames"][_POSITION]) for group in full.values() for row in group for trial in row.trials
     )
-    figure.axes[0].set(xlim=(0, most_shown(errors_m)), ylim=(0, 1))
+    figure.axes[0].set(xlim=(0, axis_limit(errors_m)), ylim=(0, 1))
     return [*plots, Plot("Errors frame by frame", text, figure)]
 
 
 def _on_most_frames(group: list[Row]) -> list[Row]:
-    most = max(row.train_frames for row in group)
-    return [row for row in group if row.train_frames == most]
+    max_frames = max(row.train_frames for row in group)
+    return [row for row in group if row.train_frames == max_frames]
 
 
 def _dots(rows: Sequence[Row], series: str | None) -> Figure:

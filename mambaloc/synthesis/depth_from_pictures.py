@@ -20,7 +20,7 @@ _POINTS_INSIDE = (0.01, 0.99)  # of the depths
 _MARGIN = 1.3
 _TRIAL_FRAMES, _TRIAL_OTHERS = 6, 1
 _TRIAL_RANGE = (0.2, 40.0)  # of how far the cameras are spread
-_LEAST_KNOWN = 0.05
+_MIN_KNOWN = 0.05
 _AT_ONCE = 128  # images that are mapped
 
 
@@ -56,7 +56,7 @@ def depth_from_pictures(
     rows = spread_rows(world_from_cam, sweep.scale_m, key_frames)
     depth_m = enlarged(sweep.depth_m(rows), images.shape[2:])
     found = confirmed(PosedDepth(images[rows], depth_m, intrinsics[rows], world_from_cam[rows]))
-    if np.isfinite(found.depth_m).mean() < _LEAST_KNOWN:
+    if np.isfinite(found.depth_m).mean() < _MIN_KNOWN:
         raise InputError(
             f"{len(images)} images: several images confirm no depth. Check poses and cameras, or do without views."
         )

@@ -14,7 +14,7 @@ from mambaloc.images import LUMA
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 from mambaloc.synthesis.splatting import Splatter
 
-LEAST_CORRELATION = 0.45
+MIN_CORRELATION = 0.45
 """Views that correlate less are not trained on."""
 
 _APART = 0.2  # see PosedDepth.apart: about as far as views lie from the frames
@@ -46,7 +46,7 @@ class Quality:
     @property
     def share(self) -> float:
         """Share of views among the images to train on: three in four; none where the depth puts surfaces elsewhere."""
-        return _USUAL_SHARE if self.correlation >= LEAST_CORRELATION else 0.0
+        return _USUAL_SHARE if self.correlation >= MIN_CORRELATION else 0.0
 
     def describe(self) -> str:
         """In one line."""

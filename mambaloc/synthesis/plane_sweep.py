@@ -166,17 +166,17 @@ def _along(lines: Tensor, small_step: float, large_step: float) -> Tensor:
     costs = torch.empty_like(lines)
     costs[0] = before = lines[0]
     for number in range(1, len(lines)):
-        least = before.amin(dim=0, keepdim=True)
-        best = torch.minimum(before, least + large_step)
+        lowest = before.amin(dim=0, keepdim=True)
+        best = torch.minimum(before, lowest + large_step)
         best[1:] = torch.minimum(best[1:], before[:-1] + small_step)
         best[:-1] = torch.minimum(best[:-1], before[1:] + small_step)
-        before = torch.add(lines[number], best.sub_(least), out=costs[number])
+        before = torch.add(lines[number], best.sub_(lowest), out=costs[number])
     return costs
 
 
 def between_planes(volume: Tensor, inverse: Tensor) -> Tensor:
     """Inverse depth of the least cost, between planes by a parabola; (D, h, w), (D,) -> (h, w)."""
-    least = volume.argmin(dim=0).clamp(1, len(inverse) - 2)
-    before, at, after = (volume.gather(0, (least + step)[None])[0] for step in (-1, 0, 1))
+    cheapest = volume.argmin(dim=0).clamp(1, len(inverse) - 2)
+    before, at, after = (volume.gather(0, (cheapest + step)[None])[0] for step in (-1, 0, 1))
     offset = ((before - after) / (2 * (before - 2 * at + after)).clamp(min=1e-6)).clamp(-0.5, 0.5)
-    return inverse[0] + (least + offset) * (inverse[1] - inverse[0])
+    return inverse[0] + (cheapest + offset) * (inverse[1] - inverse[0])

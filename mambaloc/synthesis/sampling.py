@@ -16,7 +16,7 @@ from mambaloc.runtime.rotations import (
 )
 from mambaloc.synthesis.posed_depth import Floats
 
-_MOST_POSES = 2000  # pairs are a matrix
+_MAX_POSES = 2000  # pairs are a matrix
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class PoseSampler:
     """
 
     def __init__(self, world_from_cam: Floats, scale_m: float, spread: Spread | None = None) -> None:
-        rows = np.linspace(0, len(world_from_cam) - 1, min(len(world_from_cam), _MOST_POSES)).round().astype(int)
+        rows = np.linspace(0, len(world_from_cam) - 1, min(len(world_from_cam), _MAX_POSES)).round().astype(int)
         self.spread, self.scale_m = spread or Spread(), scale_m
         self.position_m = world_from_cam[rows, :3, 3]
         self.quaternion = quaternion_from_matrix(world_from_cam[rows, :3, :3])

@@ -348,7 +348,7 @@ def stop_here(*args, **options):
 
 
 def test_poor_views_are_left_out_and_the_training_goes_on(make, tmp_path, monkeypatch):
-    monkeypatch.setattr(gate, "LEAST_CORRELATION", 0.99)
+    monkeypatch.setattr(gate, "MIN_CORRELATION", 0.99)
     data, lines = lines_of(make, cache_dir=str(tmp_path), points_per_frame=8)
     assert len(lines) == 1
     assert "not worth training on. The training goes on without views." in lines[0]

@@ -23,7 +23,7 @@ from mambaloc.mapping.building import MapSettings
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.maps import CameraPose, MapLocalization, MapLocalizer
-from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, MOST_DEVIATION, Evidence
+from mambaloc.runtime.maps.acceptance import MAX_DEVIATION, MIN_PROBABILITY, Evidence
 from mambaloc.runtime.maps.features import rescaled_intrinsics
 from mambaloc.runtime.maps.viewpoints import spread_m
 from mambaloc.runtime.rotations import matrix_from_quaternion
@@ -38,7 +38,7 @@ _FIELDS = (
 )  # fmt: skip
 _THRESHOLDS = (0.85, 0.9, 0.92, 0.95, 0.97, 0.98, 0.99)
 _BOUNDS = (0.06, 0.09, 0.12, 0.16, 0.24, np.inf)
-_MOST_WRONG = 0.005
+_MAX_WRONG = 0.005
 _NAMES = [*DISTURBANCES, _RANDOM, "focal length x 0.9", "focal length x 1.1"]
 
 Floats = NDArray[np.float64]
@@ -149,15 +149,19 @@ def calibrate(folders: Sequence[Path]) -> str:
         f"a pose, {int(is_asked.sum())} poses",
     ]
     has_matches = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
-    can = has_matches & (of["deviation"] <= MOST_DEVIATION)
+    can = has_matches & (of["deviation"] <= MAX_DEVIATION)
     probability = _left_out(known, is_wrong, has_evidence, is_asked, group)
     chosen = is_asked & _likeliest(pictures, probability)
-    is_likely = has_matches & (probability >= LEAST_PROBABILITY)
-    for most in _BOUNDS:
-        lines.append(_shares(f"deviations to {most:.2f}", chosen, is_likely & (of["deviation"] <= most), is_wrong))
+    is_likely = has_matches & (probability >= MIN_PROBABILITY)
+    for max_deviation in _BOUNDS:
+        lines.append(
+            _shares(
+                f"deviations to {max_deviation:.2f}", chosen, is_likely & (of["deviation"] <= max_deviation), is_wrong
+            )
+        )
     lines += _thresholds(chosen, np.where(can, probability, 0), is_wrong)
     probability = np.array([each.probability for each in evidence])
-    is_final, accepted = _likeliest(pictures, probability), can & (probability >= LEAST_PROBABILITY)
+    is_final, accepted = _likeliest(pictures, probability), can & (probability >= MIN_PROBABILITY)
     rows = {"the rule as it is": is_asked}
     rows |= {folder.name: is_asked & (scene == number) for number, folder in enumerate(folders)}
     rows |= {name: of["disturbance"] == number for number, name in enumerate(_NAMES)}
@@ -169,13 +173,13 @@ def calibrate(folders: Sequence[Path]) -> str:
 
 def _thresholds(chosen: NDArray[np.bool_], probability: Floats, is_wrong: NDArray[np.bool_]) -> list[str]:
     """What each threshold accepts, and the least of those that bound the share of wrong poses."""
-    lines, least = [], None
+    lines, lowest = [], None
     for threshold in _THRESHOLDS:
         accepted = probability >= threshold
         lines.append(_shares(f"fitted to others, {threshold:.2f}", chosen, accepted, is_wrong))
-        if least is None and is_wrong[chosen & accepted].mean() <= _MOST_WRONG:
-            least = threshold
-    return [*lines, f"the least threshold with at most {_MOST_WRONG:.1%} of accepted poses wrong: {least}"]
+        if lowest is None and is_wrong[chosen & accepted].mean() <= _MAX_WRONG:
+            lowest = threshold
+    return [*lines, f"the least threshold with at most {_MAX_WRONG:.1%} of accepted poses wrong: {lowest}"]
 
 
 def _left_out(

@@ -32,7 +32,7 @@ WORLD_KEY = "world"
 COLUMNS = ("image", "sequence", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz", "camera", "split")
 SPLITS = ("train", "val", "test", "unused")
 
-MOST_FRAMES = 200_000
+MAX_FRAMES = 200_000
 _MEND = "import the scene again"
 
 
@@ -118,8 +118,8 @@ def read_rows(folder: Path) -> list[Row]:
             raise InputError(f"{path}, line {line}: {fields['image']} is on line {lines[row.image]}, too; remove one")
         lines[row.image] = line
         rows.append(row)
-        if len(rows) > MOST_FRAMES:
-            raise InputError(f"{path}: has more than {MOST_FRAMES} rows; keep fewer")
+        if len(rows) > MAX_FRAMES:
+            raise InputError(f"{path}: has more than {MAX_FRAMES} rows; keep fewer")
     if not rows:
         raise InputError(f"{path}: has no row; {_MEND}")
     return rows

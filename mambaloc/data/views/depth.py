@@ -30,7 +30,7 @@ from mambaloc.synthesis.posed_depth import Floats
 ViewDepth = Literal["auto", "sensor", "pictures"]
 VIEW_DEPTHS: tuple[str, ...] = get_args(ViewDepth)
 
-_MOST_FRAMES = 400  # with depth, spread over the poses; more cost time and add little
+_MAX_FRAMES = 400  # with depth, spread over the poses; more cost time and add little
 _ENOUGH_FRAMES = 20  # with depth; where there are fewer than twice as many frames, half of them
 _FAR_OFF = 30.0  # times: no place of one scene, but another unit
 _NAMED = 3  # files in a line
@@ -102,7 +102,7 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
     if not rows:
         raise InputError(f"{folder}: no training frame has depth. Set data.view_depth to pictures.")
     poses = poses_of(data.frames.select(np.array(rows)))
-    chosen = np.array(rows)[farthest_points(viewpoints(poses, spread_m(poses)), _MOST_FRAMES, first=0)]
+    chosen = np.array(rows)[farthest_points(viewpoints(poses, spread_m(poses)), _MAX_FRAMES, first=0)]
     files = [depth_path(data.frames.image_paths[row]) for row in chosen]
     intrinsics, poses = data.intrinsics[chosen].double().cpu().numpy(), poses_of(data.frames.select(chosen))
     read = read_all(folder, files, intrinsics, (data.images.shape[2], data.images.shape[3]))

@@ -19,7 +19,7 @@ from mambaloc.importing.motion import Motion
 
 Floats = NDArray[np.floating[Any]]
 
-_LEAST_MATCHES = 200
+_MIN_MATCHES = 200
 _AGREE = 0.3  # a tenth of matches agree with any poses
 _PLAINLY = 0.2
 _CLEARLY = 0.1
@@ -68,7 +68,7 @@ class Agreement:
     @property
     def is_known(self) -> bool:
         """Whether there are matches enough to say anything."""
-        return self.matches >= _LEAST_MATCHES
+        return self.matches >= _MIN_MATCHES
 
     @property
     def focal(self) -> float:

@@ -26,7 +26,7 @@ SCALES = np.round(np.arange(0.80, 1.2001, 0.005), 4)
 """Focal lengths and turns that are tried, over those of the capture."""
 
 _TURNED_DEG = (4.0, 20.0)  # less says little, and more is often matched wrongly
-_LEAST_MATCHES = 100
+_MIN_MATCHES = 100
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def by_depth(capture: Capture, matches: Matches) -> ByDepth | None:
     chosen = matches.of_pairs(pairs)
     depth = depth_of_matches(capture.depth, chosen)
     has_depth = np.isfinite(depth)
-    if has_depth.sum() < _LEAST_MATCHES:
+    if has_depth.sum() < _MIN_MATCHES:
         return None
 
     def median_px(focal: float, turn: float) -> float:

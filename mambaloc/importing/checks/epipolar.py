@@ -26,8 +26,8 @@ NEAR_PX = 1.5
 FOCALS = np.round(1.0125 ** np.arange(-28, 28), 4)
 """Focal lengths that are tried, over that of the capture."""
 
-_LEAST_OF_A_PAIR = 20  # matches; poses fitted to fewer agree with too many
-_MOST_BINS = 6
+_MIN_MATCHES = 20  # matches; poses fitted to fewer agree with too many
+_MAX_BINS = 6
 _FOCAL_TURN_DEG = 8.0  # of pairs by which the focal length is judged: errors of poses grow with their turns
 _FOCAL_MATCHES = 400
 
@@ -84,7 +84,7 @@ def by_baseline(matches: Matches, world_from_cam: Floats, adjusted: Floats | Non
         adjusted: other poses of the frames, in the same bins.
     """
     counts = matches.per_pair()
-    enough = np.flatnonzero(counts >= _LEAST_OF_A_PAIR)
+    enough = np.flatnonzero(counts >= _MIN_MATCHES)
     if not len(enough):
         return []
     agreeing = matches.per_pair(agrees(matches, world_from_cam))
@@ -98,10 +98,10 @@ def by_baseline(matches: Matches, world_from_cam: Floats, adjusted: Floats | Non
         here = (baseline >= low) & (baseline < high)
         if not (total := int(counts[here].sum())):
             continue
-        share, most = float(agreeing[here].sum() / total), float(possible[here].sum() / total)
+        share, possible_share = float(agreeing[here].sum() / total), float(possible[here].sum() / total)
         share_after = None if after is None else float(after[here].sum() / total)
         middle_deg = float(np.median(turn_deg[here]))
-        found.append(Bin(low, high, middle_deg, int(here.sum()), total, share, most, share_after))
+        found.append(Bin(low, high, middle_deg, int(here.sum()), total, share, possible_share, share_after))
     return found
 
 
@@ -133,7 +133,7 @@ def _round_edges(values: Floats) -> list[float]:
     """Edges 1, 2, 5, 10, ... around some lengths, so many at most: the first and last bin hold what is left."""
     steps = np.array([digit * 10.0**power for power in range(-9, 10) for digit in (1, 2, 5)])
     low, high = np.quantile(values, (0.02, 0.98))
-    inner = steps[(steps > low) & (steps < high)][-(_MOST_BINS - 1) :]
+    inner = steps[(steps > low) & (steps < high)][-(_MAX_BINS - 1) :]
     return [0.0, *inner.tolist(), float("inf")]
 
 

@@ -16,12 +16,12 @@ from mambaloc.importing.undistort.decoding import Decoding
 from mambaloc.runtime.camera_models import is_same_shape
 from mambaloc.runtime.rotations import is_rotation
 
-LEAST_FRAMES = 20
+MIN_FRAMES = 20
 _DUPLICATE_SHARE = 1e-6  # of the extent
 _DUPLICATE_DEG = 1e-3
 _MANY = 0.1
 _NAMED = 3
-_LEAST_STILL = 3  # successive frames
+_MIN_STILL = 3  # successive frames
 _MUCH = 2.0
 
 
@@ -68,9 +68,9 @@ def check_frames(capture: Capture, left_out: Mapping[str, str]) -> Finding:
     causes = [f"{count} left out: {rule}" for rule, count in rules.most_common()]
     message = "; ".join((f"{kept}", *causes[:_NAMED]))
     figures = {"kept": kept, "left_out": dict(rules)}
-    if kept < LEAST_FRAMES:
+    if kept < MIN_FRAMES:
         causes += _without(capture)
-        concern = f"{kept} usable frames, and {LEAST_FRAMES} are needed to train on some and to test on others"
+        concern = f"{kept} usable frames, and {MIN_FRAMES} are needed to train on some and to test on others"
         concern += f" ({'; '.join(causes)})" if causes else ""
         return Finding("frames", message, concern, is_fatal=True, figures=figures)
     concern = ""
@@ -168,7 +168,7 @@ def check_duplicates(capture: Capture, motion: Motion) -> Finding:
     if many >= len(grid) - 1:
         concern = "all frames have the same pose: the tracker was lost, or did not move; export poses that differ"
         return Finding("duplicate poses", f"{many}", concern, True, {"count": many})
-    if len(run) >= _LEAST_STILL:
+    if len(run) >= _MIN_STILL:
         first, last = (capture.images[run[end]].name for end in (0, -1))
         concern = (
             f"{many} frames have exactly the pose of another, most in a row {first} to {last} ({len(run)} frames): a "

@@ -134,11 +134,11 @@ def _find(source: Path, model: Path, images: Path | None, names: list[str]) -> F
     if source in (model, model.parent):  # a model's own folder, such as sparse/0: images are beside sparse
         root = source.resolve()
         folders += [root.parent / "images", root.parent.parent / "images"]
-    folder, most = images or source, 0
+    folder, best_count = images or source, 0
     for candidate in folders if images is None else ():
         count = count_there(candidate, names)
-        folder, most = (candidate, count) if count > most else (folder, most)
-        if most == len(names):
+        folder, best_count = (candidate, count) if count > best_count else (folder, best_count)
+        if best_count == len(names):
             break
     return find_images(folder, [(name, f"{model}, images") for name in names])
 

@@ -29,7 +29,7 @@ SPLITS: Mapping[str, Split] = {"mapping": "train", "validation": "val", "query":
 """What frames are for, by the name of their kapture's folder, or of the first folder of their path."""
 
 _FIRST_LINE = "# kapture format:"
-_MOST_RIGS = 8  # one on another
+_MAX_RIGS = 8  # one on another
 _SINCE_1970_S = (5e8, 5e9)  # from 1985 to 2128: other numbers may be counters
 _CHOICES = {
     "axes": "OpenCV camera axes, as COLMAP has them",
@@ -203,13 +203,13 @@ def _device(
     """The row of the pose of a sensor, or else of the nearest rig that carries it, and what leads from that to it."""
     stamp, sensor = key
     reached = [(sensor, np.eye(4))]
-    for _ in range(_MOST_RIGS):
+    for _ in range(_MAX_RIGS):
         for device, sensor_from_device in reached:
             if (stamp, device) in row_of:
                 return row_of[stamp, device], sensor_from_device
         reached = [
             (rig, sensor_from_device @ device_from_rig)
-            for device, sensor_from_device in reached[:_MOST_RIGS]
+            for device, sensor_from_device in reached[:_MAX_RIGS]
             for rig, device_from_rig in rigs.get(device, ())
         ]
     return None, np.eye(4)

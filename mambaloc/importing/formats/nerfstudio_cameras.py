@@ -24,7 +24,7 @@ KEYS = (
 """What a file, or a frame of it, says of a camera."""
 
 _BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
-_MOST_FOCAL_PX = 1e7
+_MAX_FOCAL_PX = 1e7
 
 
 def read_cameras(
@@ -84,7 +84,7 @@ def _camera(content: Mapping[str, Any], images: Sequence[Path], where: str) -> C
     focal_px = (focal[0], focal[1]) if focal[0] and focal[1] else (focal[0] or focal[1],) * 2
     center = [number(content, key, where) for key in ("cx", "cy")]
     center_px = [side / 2 if at is None else at for at, side in zip(center, sides, strict=True)]
-    if not all(1 <= side <= LARGEST_SIDE_PX for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
+    if not all(1 <= side <= LARGEST_SIDE_PX for side in sides) or not all(0 < f < _MAX_FOCAL_PX for f in focal_px):
         raise InputError(f"{where}: {sides[0]:g}x{sides[1]:g} pixels, focal length {focal_px[0]:g}: correct it")
     if not all(-side < at < 2 * side for at, side in zip(center_px, sides, strict=True)):
         raise InputError(f"{where}: its centre {center_px} is far outside the image; correct it")

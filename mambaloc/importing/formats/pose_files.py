@@ -34,7 +34,7 @@ _KIND = r"(?:colou?r|rgb|image|img|poses?|camera_pose|cam2world|extrinsics?)"
 _MARKED = re.compile(rf"{_KIND}[._-]?(?=\d)|[._-]{_KIND}$", re.IGNORECASE)
 _OTHER = re.compile(r"depth|mask|semantic|label|normal|confidence", re.IGNORECASE)
 _DEEPEST = 3  # folders below the source
-_MOST_FOLDERS = 1000
+_MAX_FOLDERS = 1000
 _SAMPLED = 20
 _SPLITS = ("train", "val", "test")
 _OFFICIAL_SIZE, _OFFICIAL_FOCAL_PX = (640, 480), 525.0  # of 7-Scenes' colour camera
@@ -147,7 +147,7 @@ def _folders(source: Path) -> Iterator[Path]:
         yield from level
         found += len(level)
         level = sorted((below for each in level for below in each.iterdir() if below.is_dir()), key=natural)
-        if found + len(level) > _MOST_FOLDERS:
+        if found + len(level) > _MAX_FOLDERS:
             return
 
 

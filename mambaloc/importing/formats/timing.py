@@ -28,9 +28,9 @@ UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _PER_S = {unit: 10**9 // per_ns for unit, per_ns in UNITS_NS.items()}
 _SINCE_1970_S = (5 * 10**8, 5 * 10**9)  # from 1985 to 2128
 _LONGEST_STEP_S = 2  # from a frame to the next
-_LEAST_STEP_OF_WHOLE = 2000  # frames are numbered in smaller steps
+_MIN_INTEGER_STEP = 2000  # frames are numbered in smaller steps
 _LARGEST_NS = 2**62
-_MOST_FRAMES = 10**6  # a larger number is not a frame's
+_MAX_FRAMES = 10**6  # a larger number is not a frame's
 _NUMBER = re.compile(r"\D*?(\d+(?:\.\d+)?)\D*", re.ASCII)
 
 
@@ -137,7 +137,7 @@ def image_stamps(images: Sequence[Path]) -> Stamps | None:
     numbers = sorted(map(Decimal, words))
     steps = sorted(after - before for before, after in pairwise(numbers))
     is_epoch = len(_possible(numbers)) == 1
-    return stamps if is_epoch or (steps and steps[len(steps) // 2] >= _LEAST_STEP_OF_WHOLE) else None
+    return stamps if is_epoch or (steps and steps[len(steps) // 2] >= _MIN_INTEGER_STEP) else None
 
 
 @dataclass(frozen=True)
@@ -254,6 +254,6 @@ def _plain(name: str) -> str:
         return stem
     number = _number(stem)
     is_time = "." in stem.removesuffix(".0")  # 12.000 may be a second, and no frame's number
-    if number is None or (is_time and number < _MOST_FRAMES):
+    if number is None or (is_time and number < _MAX_FRAMES):
         return stem
     return format(number.normalize(), "f")

@@ -24,11 +24,11 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 ASKED = ("auto", *KINDS)
 
 NEAR_STEPS = 2.0
-MOST_NEAR = 0.1
+MAX_NEAR = 0.1
 COVERAGE_RADIUS = 0.25
 COVERAGE_DEG = 30.0
 RULE = (
-    f"A split is honest where at most {MOST_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
+    f"A split is honest where at most {MAX_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
     f"training frame, and learnable where the median test frame's nearest one is within {COVERAGE_RADIUS:.0%} of the "
     f"scene's extent and {COVERAGE_DEG:g}°. A given split is taken, whatever it measures. Of the others, the first "
     f"that is both is taken, in the order {', '.join(KINDS[1:])}; failing that, the one with the fewest near frames of "
@@ -67,7 +67,7 @@ class SplitCandidate:
     @property
     def is_leak_free(self) -> bool:
         """Whether hardly any test frame is a training frame's neighbour."""
-        return self.near <= MOST_NEAR
+        return self.near <= MAX_NEAR
 
     @property
     def is_good(self) -> bool:
@@ -151,7 +151,7 @@ def _lacks_given(capture: Capture) -> str:
 
 def best_of(proposals: Sequence[SplitCandidate]) -> SplitCandidate:
     """The one with the fewest near frames of those that are learnable, or of all; among honest ones, the nearest."""
-    return min(proposals, key=lambda each: (not each.is_covered, max(each.near, MOST_NEAR), each.steps[1]))
+    return min(proposals, key=lambda each: (not each.is_covered, max(each.near, MAX_NEAR), each.steps[1]))
 
 
 def measured(kind: Kind, how: str, split: NDArray[np.str_], capture: Capture, motion: Motion) -> SplitCandidate:

@@ -115,8 +115,8 @@ def common_sizes(sizes: Iterable[Size]) -> dict[Size, Size]:
     counts = Counter(sizes)
     groups: dict[Size, list[Size]] = {}
     for size in sorted(counts, key=lambda size: (-counts[size], size)):
-        most = next((other for other in groups if _is_near(size, other)), size)
-        groups.setdefault(most, []).append(size)
+        common = next((other for other in groups if _is_near(size, other)), size)
+        groups.setdefault(common, []).append(size)
     found = {}
     for group in groups.values():
         width, height = min(width for width, _ in group), min(height for _, height in group)

@@ -308,7 +308,7 @@ def test_each_camera_has_a_focal_length_of_its_own(filmed, with_depth):
 
 def test_frames_between_move_with_their_neighbours(filmed, monkeypatch):
     """Every second frame is adjusted; the whole path was turned aside by a drift, which is taken back from all."""
-    monkeypatch.setattr("mambaloc.importing.checks.adjusting._MOST_FRAMES", 20)
+    monkeypatch.setattr("mambaloc.importing.checks.adjusting._MAX_FRAMES", 20)
     rng, poses = np.random.default_rng(3), filmed.world_from_cam.copy()
     wave = np.sin(np.arange(40)[:, None] / 5 + rng.uniform(0, 6, 3))
     poses[:, :3, :3] = Rotation.from_rotvec(np.radians(0.6) * wave).as_matrix() @ poses[:, :3, :3]
