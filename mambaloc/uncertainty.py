@@ -102,8 +102,8 @@ class UncertaintyHead(nn.Module):
 
     def distance(self, pooled_BD: Tensor) -> Tensor:
         """Distance to the nearest training image, (B,), each feature over its spread."""
-        apart_BMD = (pooled_BD.float() * self.scale).unsqueeze(1) - self.references
-        return apart_BMD.square().sum(dim=-1).amin(dim=1).sqrt()
+        difference_BMD = (pooled_BD.float() * self.scale).unsqueeze(1) - self.references
+        return difference_BMD.square().sum(dim=-1).amin(dim=1).sqrt()
 
     def calibrate(self, held_out: ErrorsByDistance, level: float) -> None:
         """Set the radii, a line of the distance each, and how far is unfamiliar.

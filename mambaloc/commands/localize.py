@@ -142,10 +142,10 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
     if args.out.suffix == ".tum":
         raise InputError(f"--out {args.out}: a bag's poses go into a bag. Give --out FILE.bag, or a folder for ROS 2.")
 
-    def record(picture: BagImage, image: Image, matrix: ArrayLike | None, pose: Localization) -> None:
+    def record(bag_image: BagImage, image: Image, matrix: ArrayLike | None, pose: Localization) -> None:
         assert recording is not None
         own = localizer.intrinsics_of((image.shape[1], image.shape[0])) if matrix is None else matrix
-        recording.add_frame(image, pose, np.datetime64(picture.ns, "ns"), own)
+        recording.add_frame(image, pose, np.datetime64(bag_image.ns, "ns"), own)
 
     summary = localize_bag(
         localizer,
@@ -156,7 +156,7 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
         args.intrinsics,
         args.world_frame,
         args.pose_frame,
-        on_picture=None if recording is None else record,
+        on_image=None if recording is None else record,
     )
     return f"{args.out}: {TOPIC}, {summary}"
 

@@ -53,9 +53,9 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
     height, width = read_image(frames.image_paths[0]).shape[:2]
     size, nvm, colmap = (width, height), folder / NVM_FILE, colmap_folder(folder)
     if "intrinsics_px" in (note := scene_note(folder)):
-        return _alike(_of_rendering(folder, note["intrinsics_px"]), size, frames)
+        return _repeated(_of_rendering(folder, note["intrinsics_px"]), size, frames)
     if dataset == "7scenes":
-        return _alike(_centered(_SEVEN_SCENES_FOCAL * width, size), size, frames)
+        return _repeated(_centered(_SEVEN_SCENES_FOCAL * width, size), size, frames)
     if nvm.is_file():
         cameras = read_nvm_cameras(nvm)
         focal_px = zip(cameras.names, cameras.focal_px, strict=True)
@@ -88,7 +88,7 @@ def known_or_assumed_cameras(dataset: str, folder: Path, frames: Frames) -> Came
         assumed = f"A focal length of {ASSUMED_FOCAL:g} of the images' longer side is assumed."
         warnings.warn(f"{error} {assumed}", InputWarning, stacklevel=2)
     height, width = read_image(frames.image_paths[0]).shape[:2]
-    return replace(_alike(assumed_intrinsics((width, height)), (width, height), frames), is_assumed=True)
+    return replace(_repeated(assumed_intrinsics((width, height)), (width, height), frames), is_assumed=True)
 
 
 def assumed_intrinsics(size: Size) -> Floats:
@@ -129,7 +129,7 @@ def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Floats:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _alike(matrix: Floats, size: Size, frames: Frames) -> Cameras:
+def _repeated(matrix: Floats, size: Size, frames: Frames) -> Cameras:
     return Cameras(np.tile(matrix, (len(frames), 1, 1)), np.tile(size, (len(frames), 1)))
 
 
@@ -156,7 +156,7 @@ def _of_model(matrices: dict[str, Floats], model: Path, folder: Path, size: Size
             "Name the model's images by their path in the scene's folder."
         )
     known = sorted((matrices[name] for name in rows), key=lambda matrix: float(matrix[0, 0]))
-    cameras = _alike(known[len(known) // 2], size, frames)
+    cameras = _repeated(known[len(known) // 2], size, frames)
     for name, row in rows.items():
         cameras.intrinsics[row] = matrices[name]
     return cameras

@@ -57,14 +57,14 @@ def _trajectory(trained: Sequence[Trained], out: Path, frames: int) -> list[Path
     for number, each in enumerate(trained, start=1):
         table, test_frames = localize_test_frames(each.system, each.data), each.data.frames("test")
         stem = "trajectory" if len(trained) == 1 else f"trajectory_{number}"
-        picture, page = out / f"{stem}.png", out / f"{stem}.html"
+        plot, page = out / f"{stem}.png", out / f"{stem}.html"
         title = f"{each.name}, {each.run}\n{_where(each.data)}"
         draw = draw_top_view if each.data.hparams["dataset"] in _OUTDOORS else draw_trajectory
         names = [f"{path.parent.name}/{path.name}" for path in test_frames.image_paths]
         with writing(out):
-            draw(table, test_frames.sequences, picture, title)
+            draw(table, test_frames.sequences, plot, title)
             write_scene_page(table, test_frames.sequences, names, page, title)
-        written += [picture, page]
+        written += [plot, page]
     return written
 
 

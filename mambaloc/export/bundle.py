@@ -172,19 +172,19 @@ def _write_frames(
     For a system that takes intrinsics there is one of another lens besides: a part of the first frame, not its middle.
     As PNG: no two decoders agree on a JPEG.
     """
-    pictures, cameras = [], np.empty((0, 3, 3))
+    images, cameras = [], np.empty((0, 3, 3))
     for each in data.each_scene():
         frames = each.frames("test")
         rows = frames.evenly_spread(max(1, _FRAMES // len(data.each_scene())))
-        pictures += [read_image(frames.image_paths[row]) for row in rows]
+        images += [read_image(frames.image_paths[row]) for row in rows]
         cameras = np.concatenate([cameras, each.scene.parts["test"].data.cameras.intrinsics[rows]])
     if contract.intrinsics is not None:
-        left = pictures[0].shape[1] // 8
-        pictures.append(pictures[0][:, left:])
+        left = images[0].shape[1] // 8
+        images.append(images[0][:, left:])
         cameras = np.concatenate([cameras, cameras[:1] - [[0, 0, left], [0, 0, 0], [0, 0, 0]]])
     (folder / "frames").mkdir()
     entries: list[dict[str, Any]] = []
-    for number, (rgb, intrinsics) in enumerate(zip(pictures, cameras, strict=True)):
+    for number, (rgb, intrinsics) in enumerate(zip(images, cameras, strict=True)):
         copy = f"frames/{number}.png"
         (folder / copy).write_bytes(cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
         described = {"file": copy, **_network_vector(system, contract, rgb, intrinsics)}

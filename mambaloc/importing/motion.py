@@ -90,7 +90,7 @@ def quaternions(capture: Capture) -> Floats:
     return quaternion_from_matrix(capture.world_from_cam[:, :3, :3])
 
 
-def apart(
+def pairwise_distances(
     position: Floats, quaternion: Floats, rows: NDArray[np.int64], others: NDArray[np.int64]
 ) -> tuple[Floats, Floats]:
     """How far each of some frames is from each of others: lengths and degrees, (R, O) each."""
@@ -109,7 +109,9 @@ def _to_nearest(position: Floats, quaternion: Floats) -> tuple[float, float]:
     lengths, turns = [], []
     everything = np.arange(len(position))
     for row in everything[:: max(1, len(everything) // 1000)]:
-        length, turn_deg = (each[0] for each in apart(position, quaternion, everything[row : row + 1], everything))
+        length, turn_deg = (
+            each[0] for each in pairwise_distances(position, quaternion, everything[row : row + 1], everything)
+        )
         length[row] = np.inf
         nearest = int(length.argmin())
         lengths.append(length[nearest])

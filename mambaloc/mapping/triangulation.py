@@ -117,8 +117,8 @@ def _world_rays(cam_from_world: Floats, seen: Observations) -> tuple[Floats, Flo
 
 def _between(start_a: Floats, ray_a: Floats, start_b: Floats, ray_b: Floats) -> Floats:
     """The middle of the shortest line between two rays, (T, 3); anywhere where they are parallel."""
-    apart, cosine = start_b - start_a, (ray_a * ray_b).sum(axis=1)
-    along_a, along_b = (apart * ray_a).sum(axis=1), (apart * ray_b).sum(axis=1)
+    baseline, cosine = start_b - start_a, (ray_a * ray_b).sum(axis=1)
+    along_a, along_b = (baseline * ray_a).sum(axis=1), (baseline * ray_b).sum(axis=1)
     scale = 1 / np.maximum(1 - cosine**2, 1e-12)
     on_a = start_a + ((along_a - cosine * along_b) * scale)[:, None] * ray_a
     on_b = start_b + ((cosine * along_a - along_b) * scale)[:, None] * ray_b

@@ -133,8 +133,8 @@ MODELS: dict[str, type[CameraModel]] = {model.name: model for model in (OpenCVMo
 
 def is_same_shape(size: Sequence[float], other: Sequence[float]) -> bool:
     """Whether one scale leads from a size to another, each of whose sides may be rounded by less than a pixel."""
-    apart = abs(other[0] / size[0] - other[1] / size[1])
-    return apart < 1 / size[0] + 1 / size[1]
+    difference = abs(other[0] / size[0] - other[1] / size[1])
+    return difference < 1 / size[0] + 1 / size[1]
 
 
 def scaled_intrinsics(

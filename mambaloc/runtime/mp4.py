@@ -33,10 +33,10 @@ def read_about(path: Path) -> About:
         moov = _moov(path)
         ticks_hz = next((_ticks_hz(moov[a:b]) for kind, a, b in _boxes(moov) if kind == b"mvhd"), 0)
         tracks = [moov[a:b] for kind, a, b in _boxes(moov) if kind == b"trak"]
-        picture = next((track for track in tracks if b"vide" in track), b"")
-        edits = [_shown_ticks(part[a:b]) for part in _inside(picture, b"edts") for kind, a, b in _boxes(part)]
-        at = picture.find(b"colrnclx")
-        transfer = struct.unpack_from(">H", picture, at + 10)[0] if at >= 0 else 0
+        video_track = next((track for track in tracks if b"vide" in track), b"")
+        edits = [_shown_ticks(part[a:b]) for part in _inside(video_track, b"edts") for kind, a, b in _boxes(part)]
+        at = video_track.find(b"colrnclx")
+        transfer = struct.unpack_from(">H", video_track, at + 10)[0] if at >= 0 else 0
         return About(edits[0] / ticks_hz if edits and edits[0] and ticks_hz else None, _HDR.get(transfer))
     except (OSError, struct.error):
         return About()

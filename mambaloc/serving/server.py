@@ -111,11 +111,11 @@ class _Endpoints:
         intrinsics = _intrinsics(request.query_params.get("intrinsics"))
         is_distorted = self._is_distorted(request.query_params.get("distorted"), intrinsics)
         is_form = request.headers.get("content-type", "").startswith(_MULTIPART)
-        pictures = await _within(_BODY_S, self._pictures(request, is_form))
-        if self.waiting + len(pictures) > self.limits.waiting:
+        images = await _within(_BODY_S, self._images(request, is_form))
+        if self.waiting + len(images) > self.limits.waiting:
             raise HTTPException(503, f"{self.waiting} images are waiting. Try again later.", {"Retry-After": "1"})
         answers = await asyncio.gather(
-            *(self._localized(Task(name, each, intrinsics, is_distorted)) for each in pictures)
+            *(self._localized(Task(name, each, intrinsics, is_distorted)) for each in images)
         )
         if is_form:
             return {"pictures": answers}
@@ -133,7 +133,7 @@ class _Endpoints:
             raise HTTPException(400, "distorted: distorted images have the intrinsics of their lens. Leave out one.")
         return text == "true"
 
-    async def _pictures(self, request: Request, is_form: bool) -> list[bytes]:
+    async def _images(self, request: Request, is_form: bool) -> list[bytes]:
         if not is_form:
             return [b"".join([chunk async for chunk in self._limited(request)])]
         # The form's fields are files of any name; others are refused.

@@ -58,11 +58,11 @@ class PoseSampler:
         self.spread, self.scale_m = spread or Spread(), scale_m
         self.position_m = world_from_cam[rows, :3, 3]
         self.quaternion = quaternion_from_matrix(world_from_cam[rows, :3, :3])
-        apart = np.linalg.norm(self.position_m[:, None] - self.position_m, axis=-1) / scale_m
+        distance = np.linalg.norm(self.position_m[:, None] - self.position_m, axis=-1) / scale_m
         turn_deg = np.degrees(2 * np.arccos(np.clip(np.abs(self.quaternion @ self.quaternion.T), 0, 1)))
-        crowd = ((apart < self.spread.crowd) & (turn_deg < self.spread.crowd_deg)).sum(axis=1)
+        crowd = ((distance < self.spread.crowd) & (turn_deg < self.spread.crowd_deg)).sum(axis=1)
         self.share = (1 / crowd) / (1 / crowd).sum()
-        self.is_near = (apart < self.spread.between) & (turn_deg < self.spread.between_deg)
+        self.is_near = (distance < self.spread.between) & (turn_deg < self.spread.between_deg)
 
     def draw(self, count: int, rng: np.random.Generator) -> Floats:
         """Draw poses, (``count``, 4, 4) ``world_from_cam``."""

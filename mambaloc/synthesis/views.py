@@ -149,7 +149,7 @@ def supported(
     free = world_from_cam[splatter.is_free(world_from_cam[:, :3, 3])]
     for start in range(0, len(free), _RENDERED):
         poses = free[start : start + _RENDERED]
-        views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, most_holes=MAX_HOLES)
+        views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, max_holes=MAX_HOLES)
         crowded_share = (views.depth_m < _NEAREST * splatter.scale_m).float().mean(dim=(1, 2))
         is_good = (views.hole_share <= MAX_HOLES) & (crowded_share <= _MAX_CROWDED)
         for row in is_good.nonzero()[:, 0].tolist():

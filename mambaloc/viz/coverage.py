@@ -116,9 +116,9 @@ def gaps(found: Survey, walked: Floats) -> list[Gap]:
         found: the survey.
         walked: where the key frames are, (K, 2) in its plane; what is near them counts most.
     """
-    apart = np.sqrt(((found.places[:, None] - found.places) ** 2).sum(axis=2)) / found.step
+    distance = np.sqrt(((found.places[:, None] - found.places) ** 2).sum(axis=2)) / found.step
     off = np.sqrt(((found.places[:, None] - walked) ** 2).sum(axis=2)).min(axis=1)
-    nearby = np.exp(-((apart / 2) ** 2))
+    nearby = np.exp(-((distance / 2) ** 2))
     lost, known = (nearby @ _blurred(each) for each in ((1 - found.certainty) ** 2, found.certainty**2))
     region = lost * known * (1 - found.certainty) * np.exp(-((off / (2 * found.step)) ** 2))[:, None]
     chosen: list[Gap] = []
@@ -129,7 +129,7 @@ def gaps(found: Survey, walked: Floats) -> list[Gap]:
         angle = found.headings[heading]
         direction = np.array([np.cos(angle), np.sin(angle)])
         chosen.append(Gap(found.places[place], direction, float(found.matches[place, heading])))
-        region *= 1 - np.exp(-((apart[place, :, None] / 4) ** 4))
+        region *= 1 - np.exp(-((distance[place, :, None] / 4) ** 4))
     return chosen
 
 

@@ -334,7 +334,7 @@ def test_depth_that_cannot_be_used_gives_way_to_the_pictures_unless_it_was_asked
             make(root=root, cache_dir=str(tmp_path), view_depth="sensor").train_dataloader()
     from mambaloc.data.views import depth
 
-    monkeypatch.setattr(depth, "depth_from_pictures", stop_here)
+    monkeypatch.setattr(depth, "depth_from_images", stop_here)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         make(root=root, cache_dir=str(tmp_path)).train_dataloader()

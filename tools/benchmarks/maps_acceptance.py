@@ -77,9 +77,9 @@ def _answers(
     turn = cv2.Rodrigues(np.radians(rng.normal(0, _PRIOR[1], 3)))[0]
     prior = CameraPose(turn @ truth[:3, :3], truth[:3, 3] + rng.normal(0, near_m, 3))
     found = []
-    for count, (number, picture, scale) in enumerate(_pictures(rgb, rng)):
-        matrix = rescaled_intrinsics(intrinsics, (rgb.shape[1], rgb.shape[0]), (picture.shape[1], picture.shape[0]))
-        features = localizer.features(picture, np.diag((scale, scale, 1)) @ matrix + _centered(matrix, scale))
+    for count, (number, image, scale) in enumerate(_disturbed(rgb, rng)):
+        matrix = rescaled_intrinsics(intrinsics, (rgb.shape[1], rgb.shape[0]), (image.shape[1], image.shape[0]))
+        features = localizer.features(image, np.diag((scale, scale, 1)) @ matrix + _centered(matrix, scale))
         alone = localizer.localize_features(features)
         answers = [alone] if alone.is_accepted else [alone, localizer.localize_features(features, prior)]
         distinct = {answer.evidence: answer for answer in answers if answer.evidence is not None}
@@ -94,7 +94,7 @@ def _centered(matrix: Floats, scale: float) -> Floats:
     return kept
 
 
-def _pictures(rgb: Image, rng: np.random.Generator) -> list[tuple[int, Image, float]]:
+def _disturbed(rgb: Image, rng: np.random.Generator) -> list[tuple[int, Image, float]]:
     """Number of each disturbance, the image, and by what its focal length is stated wrongly."""
     fixed = [(number, disturb(rgb, rng), 1.0) for number, disturb in enumerate(DISTURBANCES.values())]
     drawn = [(_NAMES.index(_RANDOM), _drawn(rgb, rng), 1.0) for _ in range(_DRAWN)]
@@ -141,17 +141,17 @@ def calibrate(folders: Sequence[Path]) -> str:
     known = np.array([each.logarithms() for each in evidence])
     is_asked = of["disturbance"] <= _NAMES.index(_RANDOM)
     group = 100 * scene + of["fold"]
-    pictures = np.column_stack((group, of["frame"], of["picture"]))
+    image_keys = np.column_stack((group, of["frame"], of["picture"]))
     fit = _fit(known[has_evidence & is_asked], is_wrong[has_evidence & is_asked])
     lines = [
         "constant, log(cells + 0.5), log(deviation), log(turn + 0.1): " + " ".join(f"{each:.2f}" for each in fit),
-        f"{len(np.unique(pictures[:, :2], axis=0))} frames, {len(np.unique(pictures[is_asked], axis=0))} images with "
-        f"a pose, {int(is_asked.sum())} poses",
+        f"{len(np.unique(image_keys[:, :2], axis=0))} frames, {len(np.unique(image_keys[is_asked], axis=0))} images "
+        f"with a pose, {int(is_asked.sum())} poses",
     ]
     has_matches = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
     can = has_matches & (of["deviation"] <= MAX_DEVIATION)
     probability = _left_out(known, is_wrong, has_evidence, is_asked, group)
-    chosen = is_asked & _likeliest(pictures, probability)
+    chosen = is_asked & _likeliest(image_keys, probability)
     is_likely = has_matches & (probability >= MIN_PROBABILITY)
     for max_deviation in _BOUNDS:
         lines.append(
@@ -161,7 +161,7 @@ def calibrate(folders: Sequence[Path]) -> str:
         )
     lines += _thresholds(chosen, np.where(can, probability, 0), is_wrong)
     probability = np.array([each.probability for each in evidence])
-    is_final, accepted = _likeliest(pictures, probability), can & (probability >= MIN_PROBABILITY)
+    is_final, accepted = _likeliest(image_keys, probability), can & (probability >= MIN_PROBABILITY)
     rows = {"the rule as it is": is_asked}
     rows |= {folder.name: is_asked & (scene == number) for number, folder in enumerate(folders)}
     rows |= {name: of["disturbance"] == number for number, name in enumerate(_NAMES)}
@@ -213,9 +213,9 @@ def _read(folders: Sequence[Path]) -> tuple[dict[str, Floats], NDArray[np.int64]
     return dict(zip(_FIELDS, np.concatenate(tables).T, strict=True)), scene
 
 
-def _likeliest(pictures: Floats, probability: Floats) -> NDArray[np.bool_]:
+def _likeliest(image_keys: Floats, probability: Floats) -> NDArray[np.bool_]:
     """Which pose of each image, a row of keys, is the answer."""
-    _, number = np.unique(pictures, axis=0, return_inverse=True)
+    _, number = np.unique(image_keys, axis=0, return_inverse=True)
     order = np.lexsort((-probability, number.ravel()))
     is_first = np.diff(number.ravel()[order], prepend=-1) > 0
     chosen = np.zeros(len(probability), bool)

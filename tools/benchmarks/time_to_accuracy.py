@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from maps_beside import errors_of_pose
-from maps_colmap import ColmapRoute, Pictures
+from maps_colmap import ColmapRoute, WrittenImages
 from maps_scenes import key_and_query
 from rich.console import Console
 from rich.table import Table
@@ -173,11 +173,11 @@ def _map(recipe: MapRecipe, started: float) -> tuple[float, tuple[tuple[float, E
 def _colmap(recipe: MapRecipe, work: Path, started: float) -> tuple[float, tuple[tuple[float, Errors], ...]]:
     train, queries = key_and_query(recipe, None)
     key = train.select(farthest_first(train.world_from_cam, recipe.settings.key_frames))
-    route = ColmapRoute(Pictures.write(key, recipe.settings.width, work / "key"), work / "route")
+    route = ColmapRoute(WrittenImages.write(key, recipe.settings.width, work / "key"), work / "route")
     route.work.mkdir()
     route.build()
     built_s = time.time() - started
-    shown = Pictures.write(queries, recipe.settings.width, work / "query")
+    shown = WrittenImages.write(queries, recipe.settings.width, work / "query")
     scores = [
         errors_of_pose(pose, truth) for pose, truth in zip(route.localize(shown), shown.world_from_cam, strict=True)
     ]

@@ -24,7 +24,7 @@ from mambaloc.data.points.depth import depth_rows
 from mambaloc.errors import InputError
 from mambaloc.runtime.maps.viewpoints import farthest_points, spread_m, viewpoints
 from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
-from mambaloc.synthesis import PosedDepth, carried_depth, depth_from_pictures, without_disagreeing
+from mambaloc.synthesis import PosedDepth, carried_depth, depth_from_images, without_disagreeing
 from mambaloc.synthesis.posed_depth import Floats
 
 ViewDepth = Literal["auto", "sensor", "pictures"]
@@ -82,7 +82,7 @@ def depth_of_frames(folder: Path, data: CachedFrames, how: ViewDepth, device: to
         lines = [f"{folder}: {len(rows)} of {len(data.frames)} training frames have depth, too few. {_SEARCHED}"]
     intrinsics = data.intrinsics.double().cpu().numpy()
     try:
-        found = depth_from_pictures(data.images, intrinsics, poses_of(data.frames), device=device)
+        found = depth_from_images(data.images, intrinsics, poses_of(data.frames), device=device)
     except InputError as error:
         raise InputError(" ".join([*lines, str(error)])) from None
     return FoundDepth("pictures", found, lines)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mambaloc.data.depth_frames import NO_DEPTH_MM, read_complete_png, read_depth_mm
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture, Depth
-from mambaloc.importing.checks.epipolar import apart_of
+from mambaloc.importing.checks.epipolar import pair_distances
 from mambaloc.importing.checks.matching import Matches
 
 Floats = NDArray[np.floating[Any]]
@@ -76,7 +76,7 @@ def by_depth(capture: Capture, matches: Matches) -> ByDepth | None:
     """
     if capture.depth is None:
         return None
-    turn_deg = apart_of(matches, capture.world_from_cam)[1]
+    turn_deg = pair_distances(matches, capture.world_from_cam)[1]
     pairs = np.flatnonzero((turn_deg >= _TURNED_DEG[0]) & (turn_deg <= _TURNED_DEG[1]))
     chosen = matches.of_pairs(pairs)
     depth = depth_of_matches(capture.depth, chosen)

@@ -91,7 +91,7 @@ def by_baseline(matches: Matches, world_from_cam: Floats, adjusted: Floats | Non
     possible = np.array([max(_fitted(matches, pair), agreeing[pair]) for pair in enough.tolist()])
     counts, agreeing = counts[enough], agreeing[enough]
     after = None if adjusted is None else matches.per_pair(agrees(matches, adjusted))[enough]
-    baseline, turn_deg = (each[enough] for each in apart_of(matches, world_from_cam))
+    baseline, turn_deg = (each[enough] for each in pair_distances(matches, world_from_cam))
     edges = _round_edges(baseline)
     found = []
     for low, high in pairwise(edges):
@@ -107,7 +107,7 @@ def by_baseline(matches: Matches, world_from_cam: Floats, adjusted: Floats | Non
 
 def by_focal(matches: Matches, world_from_cam: Floats) -> Floats:
     """The share of matches that agree at each of :data:`FOCALS`, by pairs turned little where there are some."""
-    little = np.flatnonzero(apart_of(matches, world_from_cam)[1] <= _FOCAL_TURN_DEG)
+    little = np.flatnonzero(pair_distances(matches, world_from_cam)[1] <= _FOCAL_TURN_DEG)
     judged = matches.of_pairs(little)
     judged = judged if len(judged.pair) >= _FOCAL_MATCHES else matches
     return np.array([agrees(judged, world_from_cam, focal).mean() for focal in FOCALS])
@@ -122,7 +122,7 @@ def best_focal(share: Floats) -> float:
     return float(FOCALS[at] * (FOCALS[at + 1] / FOCALS[at]) ** offset)
 
 
-def apart_of(matches: Matches, world_from_cam: Floats) -> tuple[Floats, Floats]:
+def pair_distances(matches: Matches, world_from_cam: Floats) -> tuple[Floats, Floats]:
     """How far the images of each pair are apart, in the capture's unit and in degrees, (P,) each."""
     first, second = world_from_cam[matches.pairs.T]
     turn_deg = rotation_error_deg(*(quaternion_from_matrix(each[:, :3, :3]) for each in (first, second)))

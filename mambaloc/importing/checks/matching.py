@@ -16,7 +16,7 @@ from rich.progress import track
 from mambaloc.data.cameras import assumed_intrinsics
 from mambaloc.images import Image, read_image
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.motion import Motion, apart, quaternions
+from mambaloc.importing.motion import Motion, pairwise_distances, quaternions
 from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps.features import Features, detect_features
@@ -115,7 +115,7 @@ def neighbours(capture: Capture, motion: Motion) -> list[tuple[int, int]]:
         others = np.array(
             [other for other in others if capture.sequences[other] == capture.sequences[row]], dtype=np.int64
         )
-        length, turn_deg = (each[0] for each in apart(position, quaternion, every[row : row + 1], others))
+        length, turn_deg = (each[0] for each in pairwise_distances(position, quaternion, every[row : row + 1], others))
         pairs = set()
         for max_turn_deg in _MAX_TURNS_DEG:
             fits = np.flatnonzero((turn_deg <= max_turn_deg) & (length >= _MIN_MOVE * motion.extent))

@@ -98,7 +98,7 @@ def count_there(folder: Path, names: Sequence[str]) -> int:
     paths = [path for name in names if (path := path_inside(folder, name)) is not None]
     if count := sum(path.is_file() for path in paths):
         return count
-    stems = {parent: {picture.stem for picture in list_images(parent)} for parent in {path.parent for path in paths}}
+    stems = {parent: {image.stem for image in list_images(parent)} for parent in {path.parent for path in paths}}
     return sum(path.stem in stems[path.parent] for path in paths)
 
 

@@ -178,7 +178,7 @@ def inside(folder: Path, name: Any, where: str) -> Path:
 
 def images_in_same_folders(images: Iterable[Path]) -> list[Path]:
     """All images in the folders that images are in, as :func:`list_images`."""
-    return [picture for folder in dict.fromkeys(image.parent for image in images) for picture in list_images(folder)]
+    return [sibling for folder in dict.fromkeys(image.parent for image in images) for sibling in list_images(folder)]
 
 
 def first_with_images(folders: Sequence[Path]) -> Path:

@@ -185,7 +185,7 @@ def pose_files(folder: Path) -> dict[Path, Layout]:
     """The files of a folder whose lines are poses; none that has an image's name, which it labels."""
     if not folder.is_dir():
         return {}
-    pictured = {picture.name.partition(".")[0] for picture in list_images(folder)}
+    pictured = {image.name.partition(".")[0] for image in list_images(folder)}
     texts = [
         path
         for path in sorted(folder.iterdir())

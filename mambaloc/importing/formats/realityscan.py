@@ -36,7 +36,7 @@ _POSE = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 _LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 """Columns that may be missing from an export; they are then zeros."""
 _NEWER = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
-_FILM_MM = 36.0
+_FULL_FRAME_MM = 36.0
 _BEFORE_HEADER = 5  # lines, as the number of cameras
 _CHOICES = {
     "axes": "OpenGL's (x right, y up, z back), turned to OpenCV's; angles turn about z, x and y",
@@ -172,7 +172,7 @@ def _camera(size: tuple[int, int], numbers: Sequence[float], where: str) -> Came
     """The camera of a row's f and lens."""
     focal, px, py, *radial, t1, t2 = numbers
     longer = max(size)
-    focal_px = focal / _FILM_MM * longer
+    focal_px = focal / _FULL_FRAME_MM * longer
     center = [side / 2 + share * longer - CORNER_PX for side, share in zip(size, (px, py), strict=True)]
     camera = pinhole(size, (focal_px, focal_px), center, where)
     if not np.isfinite([*radial, t1, t2]).all():

@@ -58,7 +58,7 @@ class BagTopics:
         pose_frame: the frame that the poses are of, where their messages do not say it.
     """
 
-    pictures: str | None = None
+    images: str | None = None
     poses: str | None = None
     pose_frame: str | None = None
 
@@ -76,7 +76,7 @@ def read_ros_bag(source: Path, topics: BagTopics | None = None) -> Capture:
     """
     asked = topics or BagTopics()
     with open_bag(source) as bag:
-        topic = image_topic(bag, asked.pictures)
+        topic = image_topic(bag, asked.images)
         camera_info = camera_of(bag, topic)
         digest = digest_of(_files(source), _VERSION, topic, asked.poses, asked.pose_frame)
         folder = cached_folder(f"bags/{digest}", lambda partial: _write_chosen(bag, topic, asked, partial))
@@ -159,7 +159,7 @@ def _files(source: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class _PosedFrame(SourceFrame):
-    picture: BagImage
+    bag_image: BagImage
     pose: NDArray[np.float64]
 
 
@@ -172,23 +172,23 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
     def with_pose() -> Iterator[_PosedFrame]:
         seen = set()
         count, console = bag.counts[topic], Console(stderr=True)
-        for picture in track(images_of(bag, topic), "Choosing frames", count, console=console, transient=True):
-            pose = along(source.path, picture.ns)
+        for bag_image in track(images_of(bag, topic), "Choosing frames", count, console=console, transient=True):
+            pose = along(source.path, bag_image.ns)
             if isinstance(pose, Gap):
                 gaps.add(pose)
-            elif isinstance(picture.image, str):
-                damaged[f"{topic}, message {picture.number}"] = picture.image
-            elif picture.ns not in seen:  # else it was recorded twice
-                seen.add(picture.ns)
-                yield _PosedFrame(str(picture.number), picture.ns / 1e9, picture.image, picture, pose)
+            elif isinstance(bag_image.image, str):
+                damaged[f"{topic}, message {bag_image.number}"] = bag_image.image
+            elif bag_image.ns not in seen:  # else it was recorded twice
+                seen.add(bag_image.ns)
+                yield _PosedFrame(str(bag_image.number), bag_image.ns / 1e9, bag_image.image, bag_image, pose)
 
     frames, poses = [], []
     for frame in choose_frames(with_pose()):
         assert isinstance(frame, _PosedFrame)
-        data, suffix = _file_of(frame.picture)
-        name = f"{frame.picture.number:06d}{suffix}"
+        data, suffix = _file_of(frame.bag_image)
+        name = f"{frame.bag_image.number:06d}{suffix}"
         (folder / name).write_bytes(data)
-        frames.append({"name": name, "ns": frame.picture.ns})
+        frames.append({"name": name, "ns": frame.bag_image.ns})
         poses.append(frame.pose)
     if not frames:
         raise InputError(
@@ -208,10 +208,10 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
     (folder / _NOTE).write_text(json.dumps(note), encoding="utf-8")
 
 
-def _file_of(picture: BagImage) -> tuple[bytes, str]:
+def _file_of(bag_image: BagImage) -> tuple[bytes, str]:
     """The image's file as it was recorded, or a PNG, and its suffix."""
     for start, suffix in ((b"\xff\xd8", ".jpg"), (b"\x89PNG", ".png")):
-        if picture.file is not None and picture.file.startswith(start):
-            return picture.file, suffix
-    image: Any = picture.image
+        if bag_image.file is not None and bag_image.file.startswith(start):
+            return bag_image.file, suffix
+    image: Any = bag_image.image
     return cv2.imencode(".png", image[..., ::-1])[1].tobytes(), ".png"

@@ -224,11 +224,11 @@ def associated(first: NDArray[Any], second: NDArray[Any], farthest: float = FART
     after = np.searchsorted(ordered, first).clip(0, len(order) - 1)
     before = (after - 1).clip(0)
     nearest = np.where(first - ordered[before] <= np.abs(ordered[after] - first), before, after)
-    apart = np.abs(ordered[nearest] - first)
-    closest_first = np.argsort(apart, kind="stable")
+    difference = np.abs(ordered[nearest] - first)
+    closest_first = np.argsort(difference, kind="stable")
     _, kept = np.unique(nearest[closest_first], return_index=True)
     rows = np.sort(closest_first[kept])
-    return [(i, int(order[nearest[i]])) for i in rows[apart[rows] < farthest].tolist()]
+    return [(i, int(order[nearest[i]])) for i in rows[difference[rows] < farthest].tolist()]
 
 
 def _by_name(images: Sequence[Path], words: Sequence[str]) -> tuple[list[tuple[int, int]], str, list[str]] | None:

@@ -27,7 +27,7 @@ from mambaloc.importing.sfm.process import Job, reconstruct
 from mambaloc.importing.sfm.unread import pose_like, warning_of
 from mambaloc.importing.undistort.decoding import choices_of, counts_of
 from mambaloc.importing.video import VIDEO_SUFFIXES, Counted, digest_of, write_frames
-from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
+from mambaloc.runtime.sources import IMAGES_HZ, SourceFrame, frames_of
 from mambaloc.user_cache import cached_folder
 
 _NEIGHBOURS = 10  # before and after a video's frame that it is matched with, beside those 2, 4, 8, ... apart
@@ -92,14 +92,14 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         counts = None if source.is_file() else counts_of(list_images(source))
         frames, total = frames_of(source) if source.is_file() else _of_images(source, counts)
-        is_film = source.is_file() or (total or 0) > _MAX_IMAGES
+        is_video = source.is_file() or (total or 0) > _MAX_IMAGES
         seen = Counted(progress.track(frames, total=total, description="Choosing frames"))
-        time_s, sizes = write_frames(choose_frames(seen) if is_film else seen, images)
+        time_s, sizes = write_frames(choose_frames(seen) if is_video else seen, images)
         names = _thinned(images, sorted(time_s))
         if len(names) < _FEWEST_FRAMES:
             few = f"{len(names)} frames that differ, of {_FEWEST_FRAMES} at least"
             raise InputError(f"{source}: shows {few}; {_ADVICE}")
-        neighbours = _NEIGHBOURS if is_film else None
+        neighbours = _NEIGHBOURS if is_video else None
         job = Job(images, names, folder / "sparse/0", len(sizes) == 1, neighbours, threads, seed)
         placed = reconstruct(job, source, _ADVICE, progress)
     share = f"{placed} of {len(names)} frames"
@@ -107,8 +107,8 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
         raise InputError(f"{source}: only {share} could be placed, less than {_MIN_PLACED:.0%}; {_ADVICE}")
     chosen = f"{len(names)} of {seen.count}, by sharpness and movement"
     choices = {
-        "frames": chosen if is_film else f"all {len(names)} photos",
-        "matching": f"{_NEIGHBOURS} neighbours of each, and farther ones" if is_film else "every pair",
+        "frames": chosen if is_video else f"all {len(names)} photos",
+        "matching": f"{_NEIGHBOURS} neighbours of each, and farther ones" if is_video else "every pair",
         "registered": f"{share} ({placed / len(names):.0%})",
         **choices_of(counts),
     }
@@ -119,9 +119,7 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
 def _of_images(folder: Path, counts: Counts | None) -> tuple[Iterator[SourceFrame], int]:
     """A folder's images in natural order, as frames."""
     paths = list_images(folder)
-    return (SourceFrame(str(at), at / PICTURES_HZ, read_image(path, counts)) for at, path in enumerate(paths)), len(
-        paths
-    )
+    return (SourceFrame(str(at), at / IMAGES_HZ, read_image(path, counts)) for at, path in enumerate(paths)), len(paths)
 
 
 def _thinned(folder: Path, names: list[str]) -> list[str]:

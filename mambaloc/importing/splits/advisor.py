@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.motion import Motion, apart, quaternions
+from mambaloc.importing.motion import Motion, pairwise_distances, quaternions
 from mambaloc.importing.splits.selection import (
     COVERAGE_DEG,
     MAX_NEAR,
@@ -99,7 +99,7 @@ class _Advisor:
         """The block of a sequence that is best seen from another pass, a fifth of it or less; None where none is."""
         every = -(-len(rows) // _LOOP_FRAMES)
         thin = rows[::every]
-        length, turn_deg = apart(self.position, self.quaternion, thin, thin)
+        length, turn_deg = pairwise_distances(self.position, self.quaternion, thin, thin)
         is_seen = (length <= _LOOP_REACH * self.motion.extent) & (turn_deg <= COVERAGE_DEG)
         steps = self.motion.steps(length, turn_deg)
         time = np.arange(len(thin))
@@ -140,7 +140,9 @@ class _Advisor:
         for rows in self.sequences:
             test, near = rows[split[rows] == "test"], np.zeros(len(rows), dtype=bool)
             for start in range(0, len(test), _AT_ONCE):
-                length, turn_deg = apart(self.position, self.quaternion, test[start : start + _AT_ONCE], rows)
+                length, turn_deg = pairwise_distances(
+                    self.position, self.quaternion, test[start : start + _AT_ONCE], rows
+                )
                 steps = self.motion.steps(length, turn_deg)
                 near |= (steps <= NEAR_STEPS).any(axis=0)
             sparse[rows[near & (split[rows] == "train")]] = "unused"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.motion import Motion, apart, quaternions
+from mambaloc.importing.motion import Motion, pairwise_distances, quaternions
 
 Kind = Literal["given", "sequence", "loop", "block"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -173,7 +173,7 @@ def distances(
     Of more than a few hundred, evenly spread ones are measured.
     """
     rows = rows[np.linspace(0, len(rows) - 1, min(_MEASURED, len(rows))).round().astype(int)]
-    length, turn_deg = apart(capture.world_from_cam[:, :3, 3], quaternions(capture), rows, others)
+    length, turn_deg = pairwise_distances(capture.world_from_cam[:, :3, 3], quaternions(capture), rows, others)
     steps = motion.steps(length, turn_deg)
     nearest = steps.argmin(axis=1)
     every = np.arange(len(rows))

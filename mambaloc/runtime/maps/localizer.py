@@ -232,8 +232,8 @@ class MapLocalizer:
 
         Where the poses of a capture drift, these also agree best with each other.
         """
-        apart = ((self._viewpoints - viewpoints(pose.matrix[None], self._unit_m)) ** 2).sum(axis=1)
-        nearest = np.argsort(apart, kind="stable")[:_NEAREST]
+        squared = ((self._viewpoints - viewpoints(pose.matrix[None], self._unit_m)) ** 2).sum(axis=1)
+        nearest = np.argsort(squared, kind="stable")[:_NEAREST]
         return np.asarray(self._views[nearest].any(axis=0))
 
     def _is_own_camera(self, features: Features) -> bool:

@@ -24,7 +24,7 @@ _MIN_KNOWN = 0.05
 _AT_ONCE = 128  # images that are mapped
 
 
-def depth_from_pictures(
+def depth_from_images(
     images: NDArray[np.uint8],
     intrinsics: Floats,
     world_from_cam: Floats,
@@ -49,7 +49,7 @@ def depth_from_pictures(
     """
     small, matrices = searched(images, intrinsics)
     if points_m is None:
-        range_m = range_from_pictures(small, matrices, world_from_cam, device)
+        range_m = range_from_images(small, matrices, world_from_cam, device)
     else:
         range_m = range_of_points(points_m, intrinsics, world_from_cam, images.shape[2:])
     sweep = PlaneSweep(small, matrices, world_from_cam, range_m, settings, device)
@@ -101,7 +101,7 @@ def range_of_points(
     return near_m / _MARGIN, far_m * _MARGIN
 
 
-def range_from_pictures(
+def range_from_images(
     images: NDArray[np.uint8], intrinsics: Floats, world_from_cam: Floats, device: torch.device | str = "cpu"
 ) -> tuple[float, float]:
     """Nearest and farthest depth that a few images confirm, searched within what the cameras' spread suggests.
