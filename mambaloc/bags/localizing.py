@@ -106,7 +106,7 @@ def _stated(pose: Localization, cam_from_body: Matrix | Gap) -> tuple[Matrix, Ma
 def _body_of(bag: Bag, frame: str | None) -> Callable[[BagImage], Matrix | Gap]:
     """What gives ``cam_from_body`` (4, 4) at an image's time."""
     if frame is None:
-        return lambda picture: np.eye(4)
+        return lambda bag_image: np.eye(4)
     transforms, paths = Transforms(bag), dict[str, Chain]()
 
     def at(bag_image: BagImage) -> Matrix | Gap:

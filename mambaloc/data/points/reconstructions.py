@@ -67,7 +67,7 @@ def _agrees(model: Reconstruction, file: Path, frames: Frames) -> NDArray[np.boo
     if agrees.mean() < 0.5:
         raise InputError(
             f"{file}: its cameras are up to {distance_m.max():.3g} m and {rotation_deg.max():.3g} degrees off the "
-            f"dataset's poses, more than {TOLERANCE_M:g} m and {TOLERANCE_DEG:g} degrees; bring the model into their frame and "
-            "scale (colmap model_aligner), or remove it"
+            f"dataset's poses, more than {TOLERANCE_M:g} m and {TOLERANCE_DEG:g} degrees; bring the model into their "
+            "frame and scale (colmap model_aligner), or remove it"
         )
     return agrees
