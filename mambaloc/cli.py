@@ -32,7 +32,7 @@ from mambaloc.callbacks import (
     ViewSheet,
     WallClock,
 )
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import configure_logging, exit_on_input_error
 from mambaloc.data import MultiSceneDataModule, PoseDataModule, build_data
 from mambaloc.distillation import LitDistillation
 from mambaloc.errors import InputError
@@ -47,7 +47,7 @@ from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.files import read_yaml, writing
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.recipes import recipe_path
-from mambaloc.refusals import OneLineErrorParser, tell_refusals
+from mambaloc.refusals import OneLineErrorParser, report_refusals
 
 _RUN_DIR = "MAMBALOC_RUN_DIR"
 _SUBCOMMANDS = ("fit", "validate", "test", "predict")
@@ -284,7 +284,7 @@ def recipe_arguments(argv: list[str]) -> list[str]:
     return [subcommand, *recipes, *words]
 
 
-@exits_cleanly
+@exit_on_input_error
 def main(argv: list[str] | None = None, began_s: float | None = None) -> RecipeCLI:
     """Run ``mambaloc train``.
 
@@ -292,9 +292,9 @@ def main(argv: list[str] | None = None, began_s: float | None = None) -> RecipeC
         argv: what follows the command's name; that of this process unless given.
         began_s: as :class:`RecipeCLI` takes it.
     """
-    quieten()
+    configure_logging()
     argv = sys.argv[1:] if argv is None else argv
-    with tell_refusals(argv):
+    with report_refusals(argv):
         return RecipeCLI(
             LitPoseRegressor,
             class_from_function(build_data, L.LightningDataModule),

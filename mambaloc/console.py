@@ -21,7 +21,7 @@ _as_usual = warnings.formatwarning
 T = TypeVar("T")
 
 
-def exits_cleanly(main: Callable[..., Any]) -> Callable[..., Any]:
+def exit_on_input_error(main: Callable[..., Any]) -> Callable[..., Any]:
     """Make a tool's ``main`` print an :class:`InputError` as one line on stderr and exit with code 2.
 
     An :class:`~mambaloc.errors.InputWarning` is one line there, too.
@@ -65,12 +65,12 @@ class OptionParser(argparse.ArgumentParser):
         raise InputError(f"{message.removeprefix('argument ')}; --help lists the options")
 
 
-def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+def whole_number(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
     """Make a reader of an option's whole number within bounds, for :mod:`argparse`."""
 
     def read(text: str) -> int:
-        if not text.isdecimal() or not least <= int(text) <= (int(text) if most is None else most):
-            bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
+        if not text.isdecimal() or not minimum <= int(text) <= (int(text) if maximum is None else maximum):
+            bounds = f"of at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
             raise argparse.ArgumentTypeError(f"{text}: give a whole number {bounds}")
         return int(text)
 
@@ -116,7 +116,7 @@ class _StderrLines(logging.Handler):
         print(self.format(record), file=sys.stderr, flush=True)
 
 
-def quieten() -> None:
+def configure_logging() -> None:
     """Show the package's own log, and of libraries only what a user can act on: no hardware lists, no tips."""
     threading.excepthook = _show_unless_of_the_disk
     own = logging.getLogger("mambaloc")

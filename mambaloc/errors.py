@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from difflib import get_close_matches
 
-_MOST_LISTED = 50
+_MAX_LISTED = 50
 
 
 class InputError(Exception):
@@ -27,6 +27,6 @@ def suggestion(name: str, known: Collection[str]) -> str:
     close = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
     if close:
         return f"Did you mean {by_lower[close[0]]}?"
-    if len(known) > _MOST_LISTED:
+    if len(known) > _MAX_LISTED:
         return f"None of {len(known)} names is close to it."
     return f"Choose one of {', '.join(known)}."

@@ -19,7 +19,7 @@ _JPEG, _PNG, _TIFF = b"\xff\xd8", b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*")
 _EXIF = b"Exif\0\0"
 _APP1, _SCAN, _END = 0xE1, 0xDA, 0xD9  # of a JPEG; EXIF and XMP are in APP1, and pixels follow the scan's head
 _ORIENTATION, _SHORT = 0x0112, 3
-_MOST_ENTRIES = 1000
+_MAX_ENTRIES = 1000
 _HEAD_BYTES = 1 << 17  # a JPEG's EXIF has at most half of it
 
 _TURNS: dict[int, Callable[[Pixels], Pixels]] = {
@@ -125,7 +125,7 @@ def _in_tiff(tiff: bytes) -> int:
     try:
         (at,) = struct.unpack_from(f"{order}I", tiff, 4)
         (entries,) = struct.unpack_from(f"{order}H", tiff, at)
-        for entry in range(min(entries, _MOST_ENTRIES)):
+        for entry in range(min(entries, _MAX_ENTRIES)):
             tag, kind, count, value = struct.unpack_from(f"{order}HHIH", tiff, at + 2 + 12 * entry)
             if (tag, kind, count) == (_ORIENTATION, _SHORT, 1):
                 return value if 1 <= value <= 8 else 1

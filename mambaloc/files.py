@@ -16,8 +16,8 @@ from typing import Any
 from mambaloc.errors import InputError
 from mambaloc.text import decode_text
 
-_MOST_VALUES = 10**6
-_MOST_JSON_BYTES = 2**30
+_MAX_VALUES = 10**6
+_MAX_JSON_BYTES = 2**30
 _LONGEST_PATH = 1024  # bytes; 255 for each part, as file systems have it
 
 
@@ -60,8 +60,8 @@ def parse_yaml(text: str, path: Path, broken: str) -> Any:
 
     try:
         data = yaml.safe_load(text)
-        if _expanded(data, {}) > _MOST_VALUES:
-            raise InputError(f"{path}: its aliases stand for more than {_MOST_VALUES} values; write them out")
+        if _expanded(data, {}) > _MAX_VALUES:
+            raise InputError(f"{path}: its aliases stand for more than {_MAX_VALUES} values; write them out")
         return data
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # a ValueError: a number too long, or no date
         raise InputError(f"{path}: is not YAML ({str(error).splitlines()[0]}); {broken}") from None
@@ -72,7 +72,7 @@ def _expanded(value: Any, known: dict[int, int]) -> int:
     if not isinstance(value, dict | list):
         return 1
     if id(value) not in known:
-        known[id(value)] = _MOST_VALUES  # if it holds itself
+        known[id(value)] = _MAX_VALUES  # if it holds itself
         items = value.values() if isinstance(value, dict) else value
         known[id(value)] = 1 + sum(_expanded(item, known) for item in items)
     return known[id(value)]
@@ -81,8 +81,8 @@ def _expanded(value: Any, known: dict[int, int]) -> int:
 def read_json(path: Path, missing: str, broken: str) -> Any:
     """Read plain data from a JSON file of at most 1 GiB; the arguments and errors are those of :func:`read_yaml`."""
     try:
-        if path.stat().st_size > _MOST_JSON_BYTES:
-            raise InputError(f"{path}: is larger than {_MOST_JSON_BYTES} bytes; {broken}")
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            raise InputError(f"{path}: is larger than {_MAX_JSON_BYTES} bytes; {broken}")
         return json.loads(decode_text(path.read_bytes()))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {missing}") from None
@@ -119,7 +119,7 @@ def writing(folder: Path, remedy: str = "choose another folder with --out") -> I
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """Give a file beside a path to write to, which gets its name once the block ends; an error leaves nothing."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # nobody else's
     try:
@@ -130,7 +130,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(folder: Path, remedy: str) -> Iterator[Path]:
+def atomic_folder(folder: Path, remedy: str) -> Iterator[Path]:
     """Give an empty folder to write to, which gets its name once the block ends; an error leaves nothing.
 
     Args:

@@ -20,14 +20,14 @@ class OneLineErrorParser(LightningArgumentParser):
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Raise what is wrong as an :class:`~mambaloc.errors.InputError`."""
-        said = _without_chatter(str(message))
-        unknown = re.search(r"Expected a dot import path string: (\w+)", said)
-        if unknown and '"model' in said:
+        reason = _without_chatter(str(message))
+        unknown = re.search(r"Expected a dot import path string: (\w+)", reason)
+        if unknown and '"model' in reason:
             systems = [model_class(name).__name__ for name in list_models()]
             closest = suggestion(unknown[1], systems)
             raise InputError(f"model.class_path {unknown[1]}: no such class. {closest}")
         remedy = "; --help lists the options"  # a subcommand's parser reports to its parent, which reports again
-        raise InputError(said.replace("typing.", "").removesuffix(remedy) + remedy)
+        raise InputError(reason.replace("typing.", "").removesuffix(remedy) + remedy)
 
 
 def _without_chatter(message: str) -> str:
@@ -44,7 +44,7 @@ _REFUSING = ("lightning", "lightning_utilities", "jsonargparse")  # this for wha
 
 
 @contextmanager
-def tell_refusals(argv: list[str]) -> Iterator[None]:
+def report_refusals(argv: list[str]) -> Iterator[None]:
     """Raise what Lightning itself refuses in the block, such as a trainer's option, in one line.
 
     Args:

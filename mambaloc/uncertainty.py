@@ -33,8 +33,8 @@ LEVEL = 0.9
 
 _FAMILIAR = 0.99  # share of held-out frames that count as of the place, once there are enough
 _REFERENCES = 256  # training frames that images are compared with
-_LEAST_SPREAD = 0.1  # of a feature, over the mean of all: one that hardly varied would count for everything
-_LEAST_INTERCEPT = 0.05  # of a radius' line, over the mean error: a training image's own pose is not exact either
+_MIN_SPREAD = 0.1  # of a feature, over the mean of all: one that hardly varied would count for everything
+_MIN_INTERCEPT = 0.05  # of a radius' line, over the mean error: a training image's own pose is not exact either
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class UncertaintyHead(nn.Module):
         super().__init__()
         self.level, self.held_out_frames = math.nan, 0
         spread = references.std(dim=0, correction=0)
-        scale = 1 / spread.clamp_min(_LEAST_SPREAD * spread.mean()).clamp_min(1e-6)
+        scale = 1 / spread.clamp_min(_MIN_SPREAD * spread.mean()).clamp_min(1e-6)
         self.register_buffer("scale", scale)
         self.register_buffer("references", references * scale)
         self.register_buffer("intercepts", torch.full((2,), math.nan))
@@ -102,8 +102,8 @@ class UncertaintyHead(nn.Module):
 
     def distance(self, pooled_BD: Tensor) -> Tensor:
         """Distance to the nearest training image, (B,), each feature over its spread."""
-        apart_BMD = (pooled_BD.float() * self.scale).unsqueeze(1) - self.references
-        return apart_BMD.square().sum(dim=-1).amin(dim=1).sqrt()
+        difference_BMD = (pooled_BD.float() * self.scale).unsqueeze(1) - self.references
+        return difference_BMD.square().sum(dim=-1).amin(dim=1).sqrt()
 
     def calibrate(self, held_out: ErrorsByDistance, level: float) -> None:
         """Set the radii, a line of the distance each, and how far is unfamiliar.
@@ -190,8 +190,8 @@ def head_and_held_out(
 def _trained_on(system: LitPoseRegressor, scenes: int) -> list[str | None]:
     """Digests of each scene's training frames, where the system says them."""
     data = system.provenance.get("data", {})
-    told = list(data["scenes"].values()) if "scenes" in data else [data]
-    digests = [each.get("fingerprints", {}).get("train") for each in told]
+    scenes_data = list(data["scenes"].values()) if "scenes" in data else [data]
+    digests = [each.get("fingerprints", {}).get("train") for each in scenes_data]
     return digests if len(digests) == scenes else [None] * scenes
 
 
@@ -273,7 +273,7 @@ def conformal_quantile(values: NDArray[np.float64], level: float) -> float:
 def _radius_line(distance: NDArray[np.float64], error: NDArray[np.float64], level: float) -> tuple[float, float]:
     """Intercept and slope: the errors' least-squares line, which never falls, times what lets it hold its share."""
     slope = np.cov(distance, error)[0, 1] / max(distance.var(ddof=1), 1e-12)
-    slope = np.clip(slope, 0, (1 - _LEAST_INTERCEPT) * error.mean() / max(distance.mean(), 1e-12))
+    slope = np.clip(slope, 0, (1 - _MIN_INTERCEPT) * error.mean() / max(distance.mean(), 1e-12))
     intercept = error.mean() - slope * distance.mean()
     held = conformal_quantile(error / np.maximum(intercept + slope * distance, 1e-12), level)
     return held * intercept, held * slope

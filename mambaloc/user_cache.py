@@ -14,7 +14,7 @@ from filelock import FileLock
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.images import END_BYTES
 
 _ARRAYS = "arrays.npz"
@@ -27,7 +27,7 @@ def default_cache_dir() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mambaloc"
 
 
-def made_once(
+def cached_folder(
     name: str,
     make: Callable[[Path], object],
     cache_dir: Path | None = None,
@@ -51,20 +51,20 @@ def made_once(
         folder.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(folder.with_name(f"{folder.name}.lock")):
             if not folder.is_dir():  # another process may have made it meanwhile
-                with whole_folder(folder, remedy) as partial:
+                with atomic_folder(folder, remedy) as partial:
                     make(partial)
     except OSError as error:
         raise InputError(f"{folder.parent}: cannot be written ({error.strerror}); {remedy}") from None
     return folder
 
 
-def arrays_made_once(name: str, make: Callable[[], dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """Arrays by their names, kept in a folder of :func:`made_once`; nothing in it is ever unpickled.
+def cached_arrays(name: str, make: Callable[[], dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Arrays by their names, kept in a folder of :func:`cached_folder`; nothing in it is ever unpickled.
 
     Raises:
         InputError: where the folder cannot be written, or its file is damaged.
     """
-    file = made_once(name, lambda folder: np.savez(folder / _ARRAYS, **make())) / _ARRAYS  # type: ignore[arg-type]
+    file = cached_folder(name, lambda folder: np.savez(folder / _ARRAYS, **make())) / _ARRAYS  # type: ignore[arg-type]
     try:
         with np.load(file) as arrays:
             return dict(arrays)

@@ -24,8 +24,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
 @pytest.fixture(scope="session")
-def made_once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
-    """``made_once(name, make)``: the folder of that name, which ``make(folder)`` fills once for all xdist workers."""
+def shared_folder(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """``shared_folder(name, make)``: the folder of a name, which ``make(folder)`` fills once for all xdist workers."""
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
     shared.mkdir(exist_ok=True)
@@ -44,16 +44,16 @@ def made_once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Pat
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache_dir(made_once):
+def cache_dir(shared_folder):
     """A cache of the session's own, seen by subprocesses too: tests neither use nor fill the user's."""
-    folder = made_once("cache", lambda folder: None)
+    folder = shared_folder("cache", lambda folder: None)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MAMBALOC_CACHE", str(folder))
         yield folder
 
 
 @pytest.fixture(scope="session")
-def scenes(made_once):
+def scenes(shared_folder):
     """A folder of rendered scenes in the 7-Scenes layout; ``heads`` has 2 x 12 training and 8 test frames."""
     from mambaloc.rendering.scenes.layouts import write_7scenes
     from mambaloc.rendering.scenes.shots import frames_of_sequences
@@ -64,11 +64,11 @@ def scenes(made_once):
         sequences = {n: smooth_trajectory(8 if n == 3 else 12, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
         write_7scenes(root, "heads", frames_of_sequences(sequences, {3}), size=(96, 72), depth=True)
 
-    return made_once("scenes", render)
+    return shared_folder("scenes", render)
 
 
 @pytest.fixture(scope="session")
-def heads_and_lab(made_once, scenes):
+def heads_and_lab(shared_folder, scenes):
     """A root with ``heads``, and ``lab``: another room, whose frame lies far from its world's origin."""
     from mambaloc.rendering.scenes.layouts import write_7scenes
     from mambaloc.rendering.scenes.shots import frames_of_sequences
@@ -83,11 +83,11 @@ def heads_and_lab(made_once, scenes):
         world = {"offset_m": LAB_OFFSET_M, "metres_per_unit": 1.0}
         (lab / "scene.json").write_text(json.dumps({**note, "world": world}))
 
-    return made_once("heads_and_lab", render)
+    return shared_folder("heads_and_lab", render)
 
 
 @pytest.fixture(scope="session")
-def den(made_once):
+def den(shared_folder):
     """A root with one scene, the embedded room in the 7-Scenes layout: 32 training and 6 test frames of 160x120."""
     from mambaloc.rendering import embedded_room, embedded_walk, frames_of_sequences, write_7scenes
 
@@ -95,11 +95,11 @@ def den(made_once):
         walks = {number: embedded_walk(count, number, 0.0, 360 / count) for number, count in ((1, 32), (2, 6))}
         write_7scenes(root, "den", frames_of_sequences(walks, {2}), room=embedded_room(), size=(160, 120))
 
-    return made_once("den", render)
+    return shared_folder("den", render)
 
 
 @pytest.fixture(scope="session")
-def map_of_den(made_once, den):
+def map_of_den(shared_folder, den):
     """The file of a sparse map of the den's training frames."""
     from mambaloc.mapping import MapSettings, build_map
     from mambaloc.mapping.posed import read_frames
@@ -110,7 +110,7 @@ def map_of_den(made_once, den):
         train = read_frames(MapRecipe("den", root=str(den)), "train")
         build_map(train, MapSettings(width=160), "den").save(folder / MAP_FILE)
 
-    return made_once("map_of_den", build) / "map.safetensors"
+    return shared_folder("map_of_den", build) / "map.safetensors"
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def tiny_recipe(scenes, tmp_path):
 
 
 @pytest.fixture(scope="session")
-def trained(made_once, scenes):
+def trained(shared_folder, scenes):
     """The folder of a tiny MambaLoc's run of three epochs, validated on a sequence: every file that a run leaves."""
     from mambaloc.cli import main
 
@@ -132,11 +132,11 @@ def trained(made_once, scenes):
         options += ["--wall_clock.reach", '{"position_error_m": 1000}', "--trainer.default_root_dir"]
         main([str(recipe), *options, str(folder / "run")])
 
-    return made_once("trained", train) / "run"
+    return shared_folder("trained", train) / "run"
 
 
 @pytest.fixture(scope="session")
-def trained_student(made_once, scenes):
+def trained_student(shared_folder, scenes):
     """The folder of a tiny student's run of one epoch without validation; ``recipe.yaml`` lies in it."""
     from mambaloc.cli import main
 
@@ -145,11 +145,11 @@ def trained_student(made_once, scenes):
         recipe = write_recipe(folder / "recipe.yaml", scenes, model, {"validation": "none"}, max_epochs=1)
         main([str(recipe), "--trainer.default_root_dir", str(folder)])
 
-    return made_once("trained_student", train)
+    return shared_folder("trained_student", train)
 
 
 @pytest.fixture(scope="session")
-def trained_with_map(made_once, den):
+def trained_with_map(shared_folder, den):
     """The folder of a tiny MambaLoc's run of one epoch in ``den``, without validation, and of its map."""
     from mambaloc.cli import main
 
@@ -159,11 +159,11 @@ def trained_with_map(made_once, den):
         options = ["--map.enabled", "true", "--map.width", "160", "--map.key_frames", "30"]
         main([str(recipe), *options, "--trainer.default_root_dir", str(folder / "run")])
 
-    return made_once("trained_with_map", train) / "run"
+    return shared_folder("trained_with_map", train) / "run"
 
 
 @pytest.fixture(scope="session")
-def trained_on_two(made_once, heads_and_lab):
+def trained_on_two(shared_folder, heads_and_lab):
     """The folder of a tiny DenseLoc's run of 30 epochs on two scenes."""
     from mambaloc.cli import main
 
@@ -175,11 +175,11 @@ def trained_on_two(made_once, heads_and_lab):
         recipe = write_recipe(folder / "recipe.yaml", heads_and_lab, model, data, max_epochs=30)
         main([str(recipe), "--onnx_export.enabled", "true", "--trainer.default_root_dir", str(folder / "run")])
 
-    return made_once("trained_on_two", train) / "run"
+    return shared_folder("trained_on_two", train) / "run"
 
 
 @pytest.fixture(scope="session")
-def bundle_of_two(made_once, trained_on_two):
+def bundle_of_two(shared_folder, trained_on_two):
     """A bundle of a network that knows two scenes: float32 and float16 models that take images as they are."""
     from mambaloc.export import write_bundle
     from mambaloc.models import Checkpoint
@@ -188,22 +188,22 @@ def bundle_of_two(made_once, trained_on_two):
         checkpoint = Checkpoint.read(trained_on_two / "checkpoints/best.ckpt")
         write_bundle(checkpoint.system(), checkpoint.data(), folder / "bundle", ("onnx", "fp16"), "web")
 
-    return made_once("bundle_of_two", export) / "bundle"
+    return shared_folder("bundle_of_two", export) / "bundle"
 
 
 @pytest.fixture(scope="session")
-def bundle_of_tensors(made_once, trained_student):
+def bundle_of_tensors(shared_folder, trained_student):
     """A bundle of the tiny student: float32, float16 and ORT models that take normalised tensors."""
-    return _bundle(made_once, "bundle_of_tensors", trained_student, raw_input=False)
+    return _bundle(shared_folder, "bundle_of_tensors", trained_student, raw_input=False)
 
 
 @pytest.fixture(scope="session")
-def bundle_of_pictures(made_once, trained_student):
+def bundle_of_pictures(shared_folder, trained_student):
     """The same, with resizing, cropping and scaling inside the models."""
-    return _bundle(made_once, "bundle_of_pictures", trained_student, raw_input=True)
+    return _bundle(shared_folder, "bundle_of_pictures", trained_student, raw_input=True)
 
 
-def _bundle(made_once, name: str, run: Path, raw_input: bool) -> Path:
+def _bundle(shared_folder, name: str, run: Path, raw_input: bool) -> Path:
     from mambaloc.export import write_bundle
     from mambaloc.zoo.bundles import load_with_data
 
@@ -211,11 +211,11 @@ def _bundle(made_once, name: str, run: Path, raw_input: bool) -> Path:
         system, data = load_with_data(str(run / "checkpoints/last.ckpt"))
         write_bundle(system, data, folder / "bundle", ("onnx", "fp16", "ort"), raw_input=raw_input)
 
-    return made_once(name, export) / "bundle"
+    return shared_folder(name, export) / "bundle"
 
 
 @pytest.fixture(scope="session")
-def bundles_for_lenses(made_once, den):
+def bundles_for_lenses(shared_folder, den):
     """Bundles of a tiny DenseLoc: ``tensors``, and ``pictures``, which are taken as they are.
 
     Not in float16: an untrained network's rays hardly determine a rotation, so that rounding turns it by degrees.
@@ -240,4 +240,4 @@ def bundles_for_lenses(made_once, den):
             patch.setattr(onnx, "_write", lambda *_: shutil.copyfile(folder / "tensors/model.onnx", _[-1]))
             write_bundle(system, data, folder / "pictures", formats, "web", raw_input=True)
 
-    return made_once("bundles_for_lenses", export)
+    return shared_folder("bundles_for_lenses", export)

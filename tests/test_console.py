@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from mambaloc.console import OptionParser, exits_cleanly, thread_count, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, thread_count, whole_number
 from mambaloc.errors import InputError
 
 
-@exits_cleanly
+@exit_on_input_error
 def tool(error):
     raise error
 

@@ -28,9 +28,11 @@ def files_below(*folders):
 
 
 @pytest.fixture(scope="session")
-def built(made_once):
+def built(shared_folder):
     """The folder of both; the wheel is made of the sdist alone."""
-    return made_once("dist", lambda folder: run(sys.executable, "-m", "build", "--outdir", folder, ROOT, cwd=folder))
+    return shared_folder(
+        "dist", lambda folder: run(sys.executable, "-m", "build", "--outdir", folder, ROOT, cwd=folder)
+    )
 
 
 @pytest.fixture(scope="session")
@@ -40,14 +42,14 @@ def wheel(built):
 
 
 @pytest.fixture(scope="session")
-def installed(made_once, wheel):
+def installed(shared_folder, wheel):
     """The ``bin`` of an environment of its own, with the wheel and what it requires."""
 
     def install(folder):
         run(sys.executable, "-m", "venv", folder / "venv", cwd=folder)
         run(folder / "venv/bin/pip", "install", "--quiet", wheel, cwd=folder)
 
-    return made_once("installed", install) / "venv/bin"
+    return shared_folder("installed", install) / "venv/bin"
 
 
 def test_the_wheel_has_the_package_recipes_and_released_models_and_no_more(wheel):

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from mambaloc.errors import InputError
-from mambaloc.files import path_inside, read_json, whole_folder
-from mambaloc.user_cache import made_once
+from mambaloc.files import atomic_folder, path_inside, read_json
+from mambaloc.user_cache import cached_folder
 
 
 def test_a_folder_gets_its_name_when_it_is_whole(tmp_path):
-    with whole_folder(tmp_path / "new/a", "choose another") as partial:
+    with atomic_folder(tmp_path / "new/a", "choose another") as partial:
         (partial / "file").write_text("1")
         assert not (tmp_path / "new/a").exists()
     assert (tmp_path / "new/a/file").read_text() == "1"
@@ -22,16 +22,16 @@ def test_a_folder_gets_its_name_when_it_is_whole(tmp_path):
 
 
 def test_an_error_leaves_nothing(tmp_path):
-    with suppress(ValueError), whole_folder(tmp_path / "a", "choose another") as partial:
+    with suppress(ValueError), atomic_folder(tmp_path / "a", "choose another") as partial:
         (partial / "file").write_text("1")
         raise ValueError("half-way")
     assert not list(tmp_path.iterdir())
 
 
 def test_two_writers_do_not_meet(tmp_path):
-    slower = whole_folder(tmp_path / "a", "choose another")
+    slower = atomic_folder(tmp_path / "a", "choose another")
     (slower.__enter__() / "second").write_text("2")
-    with whole_folder(tmp_path / "a", "choose another") as faster:
+    with atomic_folder(tmp_path / "a", "choose another") as faster:
         assert not list(faster.iterdir())
         (faster / "first").write_text("1")
     with pytest.raises(InputError, match=r"a: .*; choose another"):
@@ -40,7 +40,7 @@ def test_two_writers_do_not_meet(tmp_path):
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"none\.txt: No such file"), whole_folder(tmp_path / "a", "choose another"):
+    with pytest.raises(InputError, match=r"none\.txt: No such file"), atomic_folder(tmp_path / "a", "choose another"):
         (tmp_path / "none.txt").read_text()
 
 
@@ -54,7 +54,7 @@ def test_a_folder_of_the_cache_is_made_once(tmp_path, monkeypatch):
         (partial / "file").write_text("1")
 
     found = []
-    threads = [threading.Thread(target=lambda: found.append(made_once("kind/a", make))) for _ in range(3)]
+    threads = [threading.Thread(target=lambda: found.append(cached_folder("kind/a", make))) for _ in range(3)]
     for thread in threads:
         thread.start()
     may_go_on.set()
@@ -62,25 +62,25 @@ def test_a_folder_of_the_cache_is_made_once(tmp_path, monkeypatch):
         thread.join()
     assert found == [tmp_path / "kind/a"] * 3
     assert len(calls) == 1
-    assert made_once("kind/a", make) == tmp_path / "kind/a"
+    assert cached_folder("kind/a", make) == tmp_path / "kind/a"
 
 
 def test_a_killed_maker_leaves_nothing_that_is_found(tmp_path, monkeypatch):
     monkeypatch.setenv("MAMBALOC_CACHE", str(tmp_path))
     program = (
-        "import os, signal; from mambaloc.user_cache import made_once\n"
-        "made_once('a', lambda p: ((p / 'half').write_text('1'), os.kill(os.getpid(), signal.SIGKILL)))"
+        "import os, signal; from mambaloc.user_cache import cached_folder\n"
+        "cached_folder('a', lambda p: ((p / 'half').write_text('1'), os.kill(os.getpid(), signal.SIGKILL)))"
     )
     subprocess.run([sys.executable, "-c", program], check=False)
     assert not (tmp_path / "a").exists()
-    assert [f.name for f in made_once("a", lambda p: (p / "whole").write_text("1")).iterdir()] == ["whole"]
+    assert [f.name for f in cached_folder("a", lambda p: (p / "whole").write_text("1")).iterdir()] == ["whole"]
 
 
 def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("MAMBALOC_CACHE", str(tmp_path / "file"))
     with pytest.raises(InputError, match="set MAMBALOC_CACHE"):
-        made_once("kind/a", lambda partial: None)
+        cached_folder("kind/a", lambda partial: None)
 
 
 @pytest.mark.parametrize(
@@ -128,6 +128,6 @@ def test_what_is_no_json(content, message, tmp_path):
 def test_json_that_is_too_large(tmp_path, monkeypatch):
     (tmp_path / "a.json").write_text("[1, 2, 3]")
     assert read_json(tmp_path / "a.json", "add it", "repair it") == [1, 2, 3]
-    monkeypatch.setattr("mambaloc.files._MOST_JSON_BYTES", 5)
+    monkeypatch.setattr("mambaloc.files._MAX_JSON_BYTES", 5)
     with pytest.raises(InputError, match="larger than 5 bytes; repair it"):
         read_json(tmp_path / "a.json", "add it", "repair it")

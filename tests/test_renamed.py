@@ -1,15 +1,20 @@
 """Names that were renamed are importable for one release, and warn."""
 
 import importlib
+import inspect
 
 import numpy as np
 import pytest
 import torch
 
+from mambaloc.data import Frames
+from mambaloc.demo import build_site, serve_page
 from mambaloc.export import Parity
 from mambaloc.nn import PositionScale
-from mambaloc.runtime import Localizer, PoseEstimate
+from mambaloc.renamed import renamed_arguments
+from mambaloc.runtime import Localizer, PoseEstimate, frames_of
 from mambaloc.runtime.maps import MapLocalizer
+from mambaloc.synthesis import PosedDepth, Splatter
 
 RENAMED = [
     ("mambaloc.runtime", "Localiser", "Localizer"),
@@ -25,6 +30,7 @@ RENAMED = [
     ("mambaloc.rendering", "shots_of_sequences", "frames_of_sequences"),
     ("mambaloc.demo", "embedded_film", "embedded_video"),
     ("mambaloc.nn", "Discretisation", "Discretization"),
+    ("mambaloc.synthesis", "depth_from_pictures", "depth_from_images"),
     ("mambaloc.metrics", "summarise", "summarize"),
     ("mambaloc.metrics", "summarise_errors", "summarize_errors"),
 ]
@@ -51,6 +57,7 @@ def test_other_names_are_still_missing(module):
         (Localizer, "localise", "localize", ("image", "intrinsics", True)),
         (Localizer, "localise_each", "localize_each", ("source", "intrinsics", True)),
         (MapLocalizer, "localise", "localize", ("image", "intrinsics", "prior")),
+        (PosedDepth, "apart", "distance", ("world_from_cam",)),
     ],
 )
 def test_old_methods_call_the_new_ones_and_warn(monkeypatch, kind, old, new, arguments):
@@ -76,3 +83,32 @@ def test_positions_are_normalized_by_the_old_name():
     scale.fit(position_m)
     with pytest.warns(DeprecationWarning, match="PositionScale.normalise is now normalize"):
         torch.testing.assert_close(scale.normalise(position_m), scale.normalize(position_m))
+
+
+def test_arguments_go_to_the_new_names_and_warn():
+    @renamed_arguments(old="new")
+    def double(new, other=0):
+        return 2 * new + other
+
+    with pytest.warns(DeprecationWarning, match=r"double: old is now new\. The old name is removed") as found:
+        assert double(old=3, other=1) == 7
+    assert found[0].filename == __file__
+    assert double(4) == double(new=4) == 8
+    with pytest.raises(TypeError, match="another"):
+        double(another=3)
+
+
+@pytest.mark.parametrize(
+    ("function", "old", "new"),
+    [
+        (build_site, "film", "video"),
+        (serve_page, "film", "video"),
+        (frames_of, "pictures_hz", "images_hz"),
+        (Frames.evenly_spread, "most", "count"),
+        (Splatter.render, "most_holes", "max_holes"),
+    ],
+)
+def test_old_arguments_warn(function, old, new):
+    with pytest.warns(DeprecationWarning, match=f"{old} is now {new}"), pytest.raises(TypeError):
+        function(**{old: None, "nothing": None})
+    assert new in inspect.signature(function).parameters

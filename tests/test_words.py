@@ -54,6 +54,38 @@ OLD_SPELLINGS = {
     "normalise": "deprecated",
 }
 
+NAMES = {
+    "told": "what it holds, such as content, settings, camera",
+    "said": "what it holds, such as message, notes, summary",
+    "tell": "report, write, describe",
+    "tells": "report, write, describe",
+    "says": "has, states, or what it holds",
+    "picture": "image",
+    "pictures": "images",
+    "film": "video",
+    "films": "videos",
+    "alike": "same, similar, equal",
+    "apart": "distance, difference, baseline",
+    "anew": "again",
+    "borne": "carried, kept",
+    "quieten": "configure_logging",
+    "most": "max",
+    "least": "min",
+}
+"""Words that no identifier contains, with what to write instead."""
+
+OLD_NAMES = {
+    "apart": "deprecated",
+    "pictures": "a limit of serving.Limits, and a metric",
+    "most": "an argument of add_frames",
+    "most_bytes": "a key of maps' recipes",
+    "least_inliers": "a key of maps' recipes",
+    "most_useful": "the superlative",
+    "_on_most_frames": "the superlative",
+    "at_most_one": "the words that bound a number",
+    "at_least_near_m": "the words that bound a number",
+}
+
 
 def findings(text: str) -> list[str]:
     """Each word of the list in a text, with what to write instead."""
@@ -107,6 +139,22 @@ def identifiers(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, name) for name in ast.literal_eval(node.value))
 
 
+def assigned(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Names of variables and attributes, where they are assigned, and of imports as others."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.id
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.attr
+        elif isinstance(node, ast.alias) and node.asname:
+            yield node.lineno, node.asname
+
+
+def words_of(name: str) -> list[str]:
+    """The words of an identifier, in lower case."""
+    return [word.lower() for word in re.findall("[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)]
+
+
 def _reported(path: Path, number: int, found: list[str]) -> list[str]:
     return [f"{path.relative_to(ROOT)}:{number}: {each}" for each in found]
 
@@ -141,6 +189,24 @@ def test_identifiers_are_american():
             if BRITISH.search(name) and name not in OLD_SPELLINGS
         ]
     assert not found, "\n" + "\n".join(found)
+
+
+def test_identifiers_use_plain_words():
+    found = []
+    for path in SOURCES:
+        tree = tree_of(path)
+        for number, name in [(1, path.stem), *identifiers(tree), *assigned(tree)]:
+            words = [] if name in OLD_NAMES else [word for word in words_of(name) if word in NAMES]
+            found += _reported(path, number, [f"{name}: write {NAMES[word]}" for word in words])
+    assert not found, "\n" + "\n".join(found)
+
+
+def test_words_of_identifiers_are_found_where_they_are_given():
+    source = "import a as film\ndef f(told, *, said_m=0):\n    self.picture = MOST_X = untold = 1\nclass ATell: ..."
+    names = [name for _, name in [*identifiers(ast.parse(source)), *assigned(ast.parse(source))]]
+    found = {name for name in names if {*words_of(name)} & {*NAMES}}
+    assert found == {"film", "told", "said_m", "picture", "MOST_X", "ATell"}
+    assert words_of("MapLocalizer_BND2") == ["map", "localizer", "bnd"]
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ _CHANNELS |= {"uyvy": 2, "yuv422": 2, "yuyv": 2, "yuv422_yuy2": 2}
 _CHANNELS |= {f"bayer_{pattern}8": 1 for pattern in ("rggb", "bggr", "gbrg", "grbg")}
 _TO_RGB = {
     **dict.fromkeys(("mono8", "8UC1"), cv2.COLOR_GRAY2RGB),
-    **dict.fromkeys(("bgr8", "8UC3"), cv2.COLOR_BGR2RGB),  # as OpenCV has it, where none is said
+    **dict.fromkeys(("bgr8", "8UC3"), cv2.COLOR_BGR2RGB),  # OpenCV's order, where none is stated
     **dict.fromkeys(("bgra8", "8UC4"), cv2.COLOR_BGRA2RGB),
     "rgba8": cv2.COLOR_RGBA2RGB,
     **dict.fromkeys(("uyvy", "yuv422"), cv2.COLOR_YUV2RGB_UYVY),
@@ -119,27 +119,27 @@ def camera_of(bag: Bag, topic: str) -> BagCamera | None:
     name = camera_topic(bag, topic)
     if name is None:
         return None
-    told, where = bag.first(name), f"{bag.path}: {name}"
-    matrices = {key: _numbers(told, key) for key in "kpd"}
+    info, where = bag.first(name), f"{bag.path}: {name}"
+    matrices = {key: _numbers(info, key) for key in "kpd"}
     is_rectified = "rect" in topic.removesuffix("/compressed").rpartition("/")[2]
     matrix = matrices["p"].reshape(3, 4)[:, :3] if is_rectified else matrices["k"].reshape(3, 3)
     if not np.isfinite(matrix).all() or not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
         raise InputError(f"{where}: is not calibrated (focal length 0). Calibrate the camera, or leave its topic out.")
-    matrix, size = matrix.copy(), (int(told.width), int(told.height))
-    if told.roi.width and told.roi.height:
-        matrix[:2, 2] -= (told.roi.x_offset, told.roi.y_offset)
-        size = int(told.roi.width), int(told.roi.height)
-    binning = np.maximum((told.binning_x, told.binning_y), 1).astype(float)
+    matrix, size = matrix.copy(), (int(info.width), int(info.height))
+    if info.roi.width and info.roi.height:
+        matrix[:2, 2] -= (info.roi.x_offset, info.roi.y_offset)
+        size = int(info.roi.width), int(info.roi.height)
+    binning = np.maximum((info.binning_x, info.binning_y), 1).astype(float)
     matrix[:2, 2] = (matrix[:2, 2] + CORNER_PX) / binning - CORNER_PX
     matrix[(0, 1), (0, 1)] /= binning
     size = int(size[0] // binning[0]), int(size[1] // binning[1])
     coefficients = () if is_rectified else tuple(matrices["d"].tolist())
-    return BagCamera(size, matrix, told.distortion_model, coefficients if any(coefficients) else ())
+    return BagCamera(size, matrix, info.distortion_model, coefficients if any(coefficients) else ())
 
 
-def _numbers(told: Any, name: str) -> NDArray[np.float64]:
+def _numbers(info: Any, name: str) -> NDArray[np.float64]:
     """A field that ROS 1 writes as a capital."""
-    return np.asarray(getattr(told, name, None) if hasattr(told, name) else getattr(told, name.upper()), np.float64)
+    return np.asarray(getattr(info, name, None) if hasattr(info, name) else getattr(info, name.upper()), np.float64)
 
 
 def images_of(bag: Bag, topic: str) -> Iterator[BagImage]:

@@ -37,7 +37,7 @@ def localize_bag(
     intrinsics: ArrayLike | None = None,
     world: str | None = None,
     frame: str | None = None,
-    on_picture: Callable[[BagImage, Image, ArrayLike | None, Localization], None] | None = None,
+    on_image: Callable[[BagImage, Image, ArrayLike | None, Localization], None] | None = None,
 ) -> VideoResult:
     """Localize every image of a bag, and write what a robot's filter takes: poses with covariances, at its times.
 
@@ -54,7 +54,7 @@ def localize_bag(
         world: the name of the scene's frame in messages; unless given, ``map``, or the name of the recognised scene if
             the network knows several.
         frame: whose poses to write, through the bag's transforms; the camera's optical frame unless given.
-        on_picture: is given each image, it without distortion, its intrinsics, and what was found of it.
+        on_image: is given each image, it without distortion, its intrinsics, and what was found of it.
 
     Raises:
         InputError: where a bag cannot be read or written, an image cannot be localized, or none has a pose to write.
@@ -64,28 +64,28 @@ def localize_bag(
     with open_bag(source) as bag, pose_bag(out) as write:
         topic = image_topic(bag, topic)
         body_of = _body_of(bag, frame)
-        pictures = _straight(bag, topic, straightener, intrinsics, left_out)
+        bag_images = _straight(bag, topic, straightener, intrinsics, left_out)
         console = Console(stderr=True)
         try:
-            for picture, image, matrix in track(
-                pictures, "Localizing", bag.counts[topic], console=console, transient=True
+            for bag_image, image, matrix in track(
+                bag_images, "Localizing", bag.counts[topic], console=console, transient=True
             ):
                 found.append(localizer.localize(image, matrix))
-                if on_picture is not None:
-                    on_picture(picture, image, matrix, found[-1])
-                stated = _stated(found[-1], body_of(picture))
+                if on_image is not None:
+                    on_image(bag_image, image, matrix, found[-1])
+                stated = _stated(found[-1], body_of(bag_image))
                 if isinstance(stated, str):
                     left_out[stated] += 1
                 else:
-                    write(picture.ns, world or found[-1].scene or "map", *stated)
+                    write(bag_image.ns, world or found[-1].scene or "map", *stated)
                     written += 1
         except KeyboardInterrupt:
             pass
-        said = "; ".join(f"{count} {why}" for why, count in left_out.items())
+        reasons = "; ".join(f"{count} {why}" for why, count in left_out.items())
         if not written:
-            raise InputError(f"{source}: no image of {topic} has a pose to write ({said}). {_REMEDY}")
-    if said:
-        warnings.warn(f"{out}: leaves out {said}.", InputWarning, stacklevel=2)
+            raise InputError(f"{source}: no image of {topic} has a pose to write ({reasons}). {_REMEDY}")
+    if reasons:
+        warnings.warn(f"{out}: leaves out {reasons}.", InputWarning, stacklevel=2)
     return summarize(localizer, found)
 
 
@@ -106,13 +106,13 @@ def _stated(pose: Localization, cam_from_body: Matrix | Gap) -> tuple[Matrix, Ma
 def _body_of(bag: Bag, frame: str | None) -> Callable[[BagImage], Matrix | Gap]:
     """What gives ``cam_from_body`` (4, 4) at an image's time."""
     if frame is None:
-        return lambda picture: np.eye(4)
+        return lambda bag_image: np.eye(4)
     transforms, paths = Transforms(bag), dict[str, Chain]()
 
-    def at(picture: BagImage) -> Matrix | Gap:
-        if picture.frame not in paths:
-            paths[picture.frame] = transforms.path(picture.frame, frame)
-        return along(paths[picture.frame], picture.ns)
+    def at(bag_image: BagImage) -> Matrix | Gap:
+        if bag_image.frame not in paths:
+            paths[bag_image.frame] = transforms.path(bag_image.frame, frame)
+        return along(paths[bag_image.frame], bag_image.ns)
 
     return at
 
@@ -121,17 +121,17 @@ def _straight(
     bag: Bag, topic: str, straightener: Straightener, intrinsics: ArrayLike | None, left_out: Counter[str]
 ) -> Iterator[tuple[BagImage, Image, ArrayLike | None]]:
     """A topic's whole images as the scene has them, with their intrinsics; None where nothing says them."""
-    told = None if intrinsics is not None else camera_of(bag, topic)
+    camera = None if intrinsics is not None else camera_of(bag, topic)
     made: dict[tuple[int, int], tuple[Matrix, Callable[[Image], Image]]] = {}
-    for picture in images_of(bag, topic):
-        if isinstance(picture.image, str):
+    for bag_image in images_of(bag, topic):
+        if isinstance(bag_image.image, str):
             left_out["that are damaged"] += 1
             continue
-        if told is None:
-            yield picture, picture.image, intrinsics
+        if camera is None:
+            yield bag_image, bag_image.image, intrinsics
             continue
-        size = picture.image.shape[1], picture.image.shape[0]
+        size = bag_image.image.shape[1], bag_image.image.shape[0]
         if size not in made:
-            made[size] = straightener(told, size)
+            made[size] = straightener(camera, size)
         matrix, straighten = made[size]
-        yield picture, straighten(picture.image), matrix
+        yield bag_image, straighten(bag_image.image), matrix

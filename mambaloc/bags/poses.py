@@ -37,7 +37,7 @@ class PoseSource:
     path: Chain
 
     @property
-    def said(self) -> str:
+    def chain(self) -> str:
         """The chain of frames."""
         frames = [self.world]
         for link, is_upwards in self.path:
@@ -92,8 +92,8 @@ def _link(bag: Bag, topic: str, camera: str, of: str | None) -> Link:
     """A topic's poses."""
     link = None
     for _, message in bag.messages([topic]):
-        parent, said = frame_name(message.header.frame_id), frame_name(getattr(message, "child_frame_id", ""))
-        child = said or of
+        parent, child_id = frame_name(message.header.frame_id), frame_name(getattr(message, "child_frame_id", ""))
+        child = child_id or of
         if not child:
             raise InputError(
                 f"{bag.path}: {topic} does not name the frame of its poses. Name it with --pose-frame: {camera} if "
@@ -138,9 +138,9 @@ class Gaps:
 
     def __str__(self) -> str:
         """How many there are, in a line; empty without any."""
-        said = []
+        reasons = []
         for why, count in self.counts.items():
             gap = self.longest.get(why)
             longest = f", the longest of {gap.length_s:.2f} s around {gap.ns / 1e9:.2f} s" if gap else ""
-            said.append(f"{count} {why}{longest}")
-        return f"{sum(self.counts.values())} images have no pose: {'; '.join(said)}" if said else ""
+            reasons.append(f"{count} {why}{longest}")
+        return f"{sum(self.counts.values())} images have no pose: {'; '.join(reasons)}" if reasons else ""

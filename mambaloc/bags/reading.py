@@ -131,8 +131,8 @@ def _read(path: Path, read: Callable[..., T], *arguments: Any) -> T:
     try:
         return read(*arguments)
     except Exception as error:
-        said = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: cannot be read ({type(error).__name__}: {said}). {_FORGOTTEN}") from None
+        message = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: cannot be read ({type(error).__name__}: {message}). {_FORGOTTEN}") from None
 
 
 def nanoseconds(header: Any) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mambaloc.bags.reading import import_rosbags
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, whole_folder, writing
+from mambaloc.files import atomic_file, atomic_folder, writing
 from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.maps.radii import covariance_radius
 from mambaloc.runtime.rotations import matrix_from_quaternion, quaternion_from_matrix
@@ -60,7 +60,7 @@ def pose_bag(out: Path) -> Iterator[WritePose]:
 def _ros1_bag(out: Path) -> Iterator[Any]:
     from rosbags.rosbag1 import Writer
 
-    with whole_file(out) as partial, Writer(partial) as bag:
+    with atomic_file(out) as partial, Writer(partial) as bag:
         yield bag
 
 
@@ -68,7 +68,7 @@ def _ros1_bag(out: Path) -> Iterator[Any]:
 def _ros2_bag(out: Path) -> Iterator[Any]:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    with whole_folder(out, "choose another folder with --out") as partial:
+    with atomic_folder(out, "choose another folder with --out") as partial:
         named = partial / out.name  # rosbags makes a bag's folder itself, and names its file as that
         with Writer(named, version=8, storage_plugin=StoragePlugin.MCAP) as bag:  # 8 is read by older ROS 2, too
             yield bag

@@ -135,9 +135,9 @@ def _forms(system: LitPoseRegressor, data: PoseDataModule, threads: int) -> dict
     feeds = {IMAGE_INPUT: image.numpy()}
     if system.network.takes_intrinsics:
         feeds[INTRINSICS_INPUT] = system.network.default_intrinsics[None].numpy()
-    said = summarize(localize_test_frames(system, data, "cpu"))
+    summary = summarize(localize_test_frames(system, data, "cpu"))
     return {
-        "PyTorch": _Form(weights.tell(), _eager(system, image), _medians(said)),
+        "PyTorch": _Form(weights.tell(), _eager(system, image), _medians(summary)),
         "float32": _on_onnx_runtime(exported, feeds, threads, _medians(median_errors(exported, data))),
         "float16": _on_onnx_runtime(half, feeds, threads, _medians(median_errors(half, data))),
         "int8" if int8.kind == "all layers" else f"int8 {int8.kind}": _on_onnx_runtime(

@@ -19,7 +19,7 @@ from rich.progress import track
 
 from mambaloc.benchmark.clock import now
 from mambaloc.benchmark.setting import BenchmarkConfig
-from mambaloc.console import quieten
+from mambaloc.console import configure_logging
 
 Measured = TypeVar("Measured")
 
@@ -69,7 +69,7 @@ def exponent(frames: Sequence[int], costs: Sequence[float]) -> float:
 
 def in_a_process(measure: Callable[..., Measured], *args: Any) -> Measured:
     """Run a measurement in a new process, which begins with none of this one's memory."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=quieten) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=configure_logging) as pool:
         return pool.submit(measure, *args).result()
 
 
@@ -95,8 +95,8 @@ def _train(setting: BenchmarkConfig, epochs: int) -> Footprint:
 
 def peak_bytes() -> int:
     """Largest resident memory of this process so far."""
-    if STATUS.is_file():  # what getrusage tells on Linux begins with the memory of the process that started this one
-        return said_of(STATUS, "VmHWM:") * 1024
+    if STATUS.is_file():  # what getrusage reports on Linux begins with the memory of the process that started this one
+        return proc_value(STATUS, "VmHWM:") * 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
 
@@ -106,7 +106,7 @@ def device_peak_bytes() -> int:
     return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
 
 
-def said_of(file: Path, *names: str) -> int:
+def proc_value(file: Path, *names: str) -> int:
     """Sum of the numbers that a file of ``/proc`` gives these names; those of memory are kilobytes."""
     lines = (line.split() for line in file.read_text(encoding="utf-8").splitlines())
     return sum(int(words[1]) for words in lines if words and words[0] in names)

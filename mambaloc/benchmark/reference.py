@@ -88,7 +88,7 @@ class PublishedTransPoseNet(nn.Module):
     def __init__(self, system: LitTransPoseNet) -> None:
         super().__init__()
         network: Any = deepcopy(system.network)
-        self.backbone = _whole_backbone(system, features_only=True)
+        self.backbone = _unpruned_backbone(system, features_only=True)
         encoders = (network.position_encoder, network.orientation_encoder)
         self.encoders = nn.ModuleList(PublishedEncoder(encoder) for encoder in encoders)
         self.gis = nn.ModuleList((network.position_gis, network.orientation_gis))
@@ -160,7 +160,7 @@ class PublishedAtLoc(nn.Module):
         super().__init__()
         network: Any = deepcopy(system.network)
         width = system.hparams["width"]
-        self.backbone = _whole_backbone(system, num_classes=width)
+        self.backbone = _unpruned_backbone(system, num_classes=width)
         self.backbone.get_classifier().load_state_dict(network.fc[0].state_dict())
         self.attention, self.head, self.dropout = network.attention, network.head, network.dropout.p
         self.gis = nn.ModuleList((network.first_gis, network.second_gis))
@@ -184,7 +184,7 @@ def _select(gis: Any, feats_BD: Tensor) -> Tensor:
     return gis.mixer(torch.stack((feats_BD.flip(-1), feats_BD), dim=1))[:, 1]
 
 
-def _whole_backbone(system: LitPoseRegressor, **options: Any) -> Any:
+def _unpruned_backbone(system: LitPoseRegressor, **options: Any) -> Any:
     """All stages of the same timm model, with the weights of those that are read."""
     whole: Any = timm.create_model(system.hparams["backbone"], **options, **(system.hparams["backbone_args"] or {}))
     used: Any = system.network.backbone

@@ -38,15 +38,15 @@ class BenchmarkConfig:
         Raises:
             InputError: for a file that is not an overlay.
         """
-        said = read_yaml(path, "see recipes/overlays/", "give an overlay, as recipes/overlays/ holds them")
-        if not isinstance(said, dict) or not set(said) & {"model", "data", "trainer"}:
+        overlay = read_yaml(path, "see recipes/overlays/", "give an overlay, as recipes/overlays/ holds them")
+        if not isinstance(overlay, dict) or not set(overlay) & {"model", "data", "trainer"}:
             raise InputError(f"{path}: sets nothing of model, data or trainer; give one of recipes/overlays/")
-        model = _section(path, said, "model")
+        model = _section(path, overlay, "model")
         return replace(
             self,
             model={**self.model, **_section(path, model, "init_args")},
-            data={**self.data, **_section(path, said, "data")},
-            trainer={**self.trainer, **_section(path, said, "trainer")},
+            data={**self.data, **_section(path, overlay, "data")},
+            trainer={**self.trainer, **_section(path, overlay, "trainer")},
         )
 
     def build(self, **data: Any) -> tuple[LitPoseRegressor, PoseDataModule]:
@@ -68,8 +68,8 @@ class BenchmarkConfig:
         return trainer
 
 
-def _section(path: Path, said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    section = said.get(name) or {}
+def _section(path: Path, overlay: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    section = overlay.get(name) or {}
     if not isinstance(section, dict) or not all(isinstance(key, str) for key in section):
         raise InputError(f"{path}: {name} is not a mapping. Indent its options below it.")
     return section
@@ -77,5 +77,12 @@ def _section(path: Path, said: Mapping[str, Any], name: str) -> Mapping[str, Any
 
 def _trainer(setting: BenchmarkConfig, **options: Any) -> L.Trainer:
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    told = {"accelerator": "cpu", "devices": 1, **setting.trainer, "enable_model_summary": False, **quiet, **options}
-    return L.Trainer(**{"max_epochs": 1, **told})
+    arguments = {
+        "accelerator": "cpu",
+        "devices": 1,
+        **setting.trainer,
+        "enable_model_summary": False,
+        **quiet,
+        **options,
+    }
+    return L.Trainer(**{"max_epochs": 1, **arguments})

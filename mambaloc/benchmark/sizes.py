@@ -88,17 +88,20 @@ def published_items(network: nn.Module) -> dict[str, int]:
     student carries its backbone's classifier.
     """
     if isinstance(network, Student):
-        return {"unused classifier": _whole(network.backbone.name) - parameter_count(network.backbone)}
+        return {
+            "unused classifier": _published_parameter_count(network.backbone.name) - parameter_count(network.backbone)
+        }
     if not isinstance(network, TransPoseNet):
         return {}
     encoders = (network.position_encoder, network.orientation_encoder)
     return {
-        "never reaches an output": _whole(network.backbone.name) - parameter_count(network.backbone),
+        "never reaches an output": _published_parameter_count(network.backbone.name)
+        - parameter_count(network.backbone),
         "our position tables": -sum(parameter_count(encoder.positions) for encoder in encoders),
         "published position tables": _PUBLISHED_TABLES,
     }
 
 
-def _whole(backbone: str) -> int:
+def _published_parameter_count(backbone: str) -> int:
     with torch.device("meta"):
         return parameter_count(timm.create_model(backbone))

@@ -19,7 +19,7 @@ from mambaloc.benchmark.setting import BenchmarkConfig
 from mambaloc.benchmark.speed import OURS, Program, measure_speed, times_as_long
 from mambaloc.benchmark.whole_training import WholeTraining, check_whole_training, measure_whole_training
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ def print_report(report: SpeedReport, machine: str) -> None:
 
 def write_report(report: SpeedReport, path: Path, machine: str) -> None:
     """Write every figure, and where it comes from, as JSON."""
-    told = {"machine": machine, "versions": provenance.versions(), **asdict(report)}
-    with writing(path), whole_file(path) as partial:
-        partial.write_text(json.dumps(told, indent=1, default=str), encoding="utf-8")
+    content = {"machine": machine, "versions": provenance.versions(), **asdict(report)}
+    with writing(path), atomic_file(path) as partial:
+        partial.write_text(json.dumps(content, indent=1, default=str), encoding="utf-8")
 
 
 def print_programs(report: SpeedReport, console: Console) -> None:

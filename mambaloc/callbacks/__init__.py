@@ -1,5 +1,6 @@
 """What happens around training."""
 
+from mambaloc.callbacks.atomic_checkpoints import AtomicCheckpointIO
 from mambaloc.callbacks.early_stopping import EarlyStopping
 from mambaloc.callbacks.map_build import MapBuild
 from mambaloc.callbacks.moved_run import MovedRun
@@ -10,7 +11,6 @@ from mambaloc.callbacks.trajectory_plot import TrajectoryPlot
 from mambaloc.callbacks.view_refresh import ViewRefresh
 from mambaloc.callbacks.view_sheet import ViewSheet
 from mambaloc.callbacks.wall_clock import WallClock
-from mambaloc.callbacks.whole_checkpoints import AtomicCheckpointIO
 from mambaloc.renamed import renamed
 
 __all__ = [

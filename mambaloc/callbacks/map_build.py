@@ -20,7 +20,7 @@ from mambaloc.evaluation.with_map import RUN_MAP
 from mambaloc.mapping import MapSettings, build_map
 from mambaloc.mapping.building import POINTS, describe_points
 from mambaloc.mapping.posed import with_cameras
-from mambaloc.mapping.recipe import LEAST
+from mambaloc.mapping.recipe import MINIMUM
 from mambaloc.runtime.maps import SparseMap
 
 _log = logging.getLogger(__name__)
@@ -44,9 +44,9 @@ class MapBuild(L.Callback):
     def __init__(self, enabled: bool | None = None, **settings: Any) -> None:
         self.enabled = enabled
         self.settings = MapSettings(**settings)
-        for name, least in LEAST.items():
-            if (value := getattr(self.settings, name)) < least:
-                raise InputError(f"map.{name} {value}: is less than {least}. Give more.")
+        for name, minimum in MINIMUM.items():
+            if (value := getattr(self.settings, name)) < minimum:
+                raise InputError(f"map.{name} {value}: is less than {minimum}. Give more.")
         if self.settings.points not in POINTS:
             raise InputError(f"map.points {str(self.settings.points)[:40]}: is unknown. Choose {' or '.join(POINTS)}.")
 

@@ -4,16 +4,16 @@ import argparse
 from pathlib import Path
 
 from mambaloc import benchmark, list_models, provenance
-from mambaloc.console import OptionParser, exits_cleanly, quieten, thread_count, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, thread_count, whole_number
 from mambaloc.errors import InputError
 from mambaloc.models.registry import model_class
 from mambaloc.zoo.bundles import load_with_scene
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure and print."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parts = parser.add_subparsers(required=True)
     part = parts.add_parser("sizes", help="parameter counts of every system, compared with the paper's")

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
 from mambaloc.demo import build_site, embedded_video, serve_page
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Serve the page until Ctrl-C, or write it."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument(
         "bundle", nargs="?", type=Path, help="a bundle of mambaloc export (default: the embedded room's)"

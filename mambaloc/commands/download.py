@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly
+from mambaloc.console import OptionParser, exit_on_input_error
 from mambaloc.data.download import describe_sources, download
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Read the arguments, list or download."""
     parser = OptionParser(description=__doc__)

@@ -7,7 +7,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: on a map's s
 from pathlib import Path
 
 from mambaloc.cli import OneLineErrorParser
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import configure_logging, exit_on_input_error
 from mambaloc.data import MultiSceneDataModule, build_data
 from mambaloc.errors import InputError
 from mambaloc.evaluation import (
@@ -21,10 +21,10 @@ from mambaloc.evaluation import (
 from mambaloc.models import Checkpoint
 
 
-@exits_cleanly
+@exit_on_input_error
 def main(argv: list[str] | None = None) -> None:
     """Evaluate on the data of the training recipe, changed where an option says so."""
-    quieten()
+    configure_logging()
     parser = OneLineErrorParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--out", type=Path, help="folder for the results (default: next to the checkpoint)")

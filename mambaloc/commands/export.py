@@ -3,17 +3,17 @@
 from argparse import BooleanOptionalAction
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, quieten
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error
 from mambaloc.errors import InputError
 from mambaloc.export import FORMATS, TARGETS, write_bundle
 from mambaloc.runtime.report import print_deviations
 from mambaloc.zoo.bundles import load_with_data, map_of
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Write a bundle and say how far each model is from PyTorch."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument("source", metavar="CHECKPOINT_OR_ZOO_NAME", help="RUN/checkpoints/best.ckpt, or ARCH.TAG")
     parser.add_argument("--to", default="onnx,fp16", help=f"of {', '.join(FORMATS)}, with commas")

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly
+from mambaloc.console import OptionParser, exit_on_input_error
 from mambaloc.importing.as_kapture import write_kapture
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Write it, and say how many frames each split has."""
     parser = OptionParser(description=__doc__)

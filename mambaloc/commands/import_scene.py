@@ -4,7 +4,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly
+from mambaloc.console import OptionParser, exit_on_input_error
 from mambaloc.errors import InputError
 from mambaloc.importing.formats.ros_bag import BagTopics
 from mambaloc.importing.importer import import_scene
@@ -13,7 +13,7 @@ from mambaloc.importing.report import print_summary
 from mambaloc.importing.splits.selection import ASKED
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Import, and say what was found."""
     parser = OptionParser(

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from mambaloc.bags.images import BagImage
 from mambaloc.bags.reading import is_bag
 from mambaloc.bags.writing import TOPIC
-from mambaloc.console import OptionParser, black_and_white, exits_cleanly, pinhole_matrix, thread_count
+from mambaloc.console import OptionParser, black_and_white, exit_on_input_error, pinhole_matrix, thread_count
 from mambaloc.errors import InputError
 from mambaloc.images import Image
 from mambaloc.runtime import Localizer
@@ -21,7 +21,7 @@ from mambaloc.runtime.video import FILTERS, VideoResult, localize_video
 from mambaloc.viz.rerun_recording import RerunRecording, rerun_recording
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Localize every frame and write a trajectory; Ctrl-C ends a camera's."""
     parser = OptionParser(description=__doc__)
@@ -87,11 +87,11 @@ def main() -> None:
         raise InputError(f"{args.source}: is not a ROS bag. Omit --topic, --world-frame and --pose-frame.")
     with _recording(localizer, args.rerun) as recording:
         if is_bag(Path(args.source)):
-            said = _localize_bag(localizer, args, recording)
+            summary = _localize_bag(localizer, args, recording)
         else:
             done = _localize_frames(localizer, args, recording)
-            said = f"{', '.join(map(str, done.files))}: {done}"
-    print(said)
+            summary = f"{', '.join(map(str, done.files))}: {done}"
+    print(summary)
     if args.rerun is not None:
         print(f"{args.rerun}: open it with rerun {args.rerun}")
 
@@ -142,12 +142,12 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
     if args.out.suffix == ".tum":
         raise InputError(f"--out {args.out}: a bag's poses go into a bag. Give --out FILE.bag, or a folder for ROS 2.")
 
-    def record(picture: BagImage, image: Image, matrix: ArrayLike | None, pose: Localization) -> None:
+    def record(bag_image: BagImage, image: Image, matrix: ArrayLike | None, pose: Localization) -> None:
         assert recording is not None
         own = localizer.intrinsics_of((image.shape[1], image.shape[0])) if matrix is None else matrix
-        recording.add_frame(image, pose, np.datetime64(picture.ns, "ns"), own)
+        recording.add_frame(image, pose, np.datetime64(bag_image.ns, "ns"), own)
 
-    said = localize_bag(
+    summary = localize_bag(
         localizer,
         Path(args.source),
         args.out,
@@ -156,9 +156,9 @@ def _localize_bag(localizer: Localizer, args: Namespace, recording: RerunRecordi
         args.intrinsics,
         args.world_frame,
         args.pose_frame,
-        on_picture=None if recording is None else record,
+        on_image=None if recording is None else record,
     )
-    return f"{args.out}: {TOPIC}, {said}"
+    return f"{args.out}: {TOPIC}, {summary}"
 
 
 def _model(name: str | None) -> Path:

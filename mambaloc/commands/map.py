@@ -14,7 +14,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, pinhole_matrix, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, pinhole_matrix, whole_number
 from mambaloc.errors import InputError
 from mambaloc.mapping import MapSettings
 from mambaloc.mapping.building import POINTS, describe_points
@@ -22,16 +22,16 @@ from mambaloc.mapping.evaluating import Making, build_and_measure, measure, meas
 from mambaloc.mapping.growing import add_frames, remove_session
 from mambaloc.mapping.new_frames import read_new_frames
 from mambaloc.mapping.posed import read_frames
-from mambaloc.mapping.recipe import LEAST, recipe_of
+from mambaloc.mapping.recipe import MINIMUM, recipe_of
 from mambaloc.runtime.maps import MAP_FILE, MapLocalizer, SparseMap
 from mambaloc.viz.coverage import write_coverage
 from mambaloc.viz.matches import write_points
 
 
-@exits_cleanly
+@exit_on_input_error
 def main(argv: list[str] | None = None) -> None:
     """Write map.safetensors, coverage.png, and what the map does on test frames."""
-    quieten()
+    configure_logging()
     args = _parser().parse_args(argv)
     of_added = {"name": args.name, "intrinsics": args.intrinsics is not None, "distorted": args.distorted}
     if not args.add and any(of_added.values()):
@@ -104,12 +104,12 @@ def _parser() -> OptionParser:
     )
     parser.add_argument(
         "--frames",
-        type=whole_number(LEAST["key_frames"]),
+        type=whole_number(MINIMUM["key_frames"]),
         help="number of key frames among the training or added frames (default: 160)",
     )
     parser.add_argument(
         "--width",
-        type=whole_number(LEAST["width"]),
+        type=whole_number(MINIMUM["width"]),
         help="width in pixels at which keypoints are searched; narrower images keep their size",
     )
     parser.add_argument(

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, quieten
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error
 from mambaloc.zoo.publishing import publish
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure, write, read back, measure again."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--tag", required=True, help="TAG of the released name ARCH.TAG")

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Literal
 
 from mambaloc import rendering
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Read the command line and render."""
     parser = OptionParser(description=__doc__.splitlines()[0])

@@ -3,11 +3,11 @@
 import os
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Serve bundles until Ctrl-C."""
     parser = OptionParser(description=__doc__)

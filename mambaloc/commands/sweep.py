@@ -4,14 +4,14 @@ import argparse
 from importlib.util import find_spec
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, quieten
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error
 from mambaloc.sweep import Store, print_plan, read_sweep, run_sweep
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Run trials, or report what ended."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parts = parser.add_subparsers(required=True)
     part = parts.add_parser("run", help="train and evaluate every trial of a sweep that has not finished")

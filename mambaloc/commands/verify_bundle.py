@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from mambaloc.console import OptionParser, exits_cleanly, thread_count
+from mambaloc.console import OptionParser, exit_on_input_error, thread_count
 from mambaloc.errors import InputError
 from mambaloc.runtime.bundle import verify_bundle
 from mambaloc.runtime.report import print_deviations
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Print each model's deviation; exit with code 2 where one is larger than the bundle allows."""
     parser = OptionParser(description=__doc__)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from mambaloc.cli import OneLineErrorParser
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import configure_logging, exit_on_input_error
 from mambaloc.data import MultiSceneDataModule, build_data
 from mambaloc.errors import InputError
 from mambaloc.evaluation.figures import FIGURES, draw_figures
@@ -11,10 +11,10 @@ from mambaloc.evaluation.trained import Trained, load_trained
 from mambaloc.models import Checkpoint
 
 
-@exits_cleanly
+@exit_on_input_error
 def main(argv: list[str] | None = None) -> None:
     """Draw trained systems on the test frames of their recipes, changed where an option says so."""
-    quieten()
+    configure_logging()
     parser = OneLineErrorParser(description=__doc__)
     parser.add_argument("kind", choices=list(FIGURES), help="trajectory: a figure per system; others: one figure")
     parser.add_argument("checkpoints", type=Path, nargs="+", metavar="CHECKPOINT")

@@ -27,7 +27,7 @@ from mambaloc.geometry import (
 from mambaloc.images import LUMA, center_corner
 from mambaloc.types import PoseBatch
 
-_MOST_DEG = 45.0
+_MAX_DEG = 45.0
 _DONORS = 3  # images that a hole may be filled from
 
 View = Literal["crop", "rotation"]
@@ -113,8 +113,8 @@ class RandomRotation:
     zoom: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.rotation_deg <= _MOST_DEG:
-            raise InputError(f"data.rotation_deg {self.rotation_deg:g}: must be more than 0, and {_MOST_DEG:g} at most")
+        if not 0 < self.rotation_deg <= _MAX_DEG:
+            raise InputError(f"data.rotation_deg {self.rotation_deg:g}: must be more than 0, and {_MAX_DEG:g} at most")
         if not 0 <= self.zoom < math.inf:
             raise InputError(f"data.zoom {self.zoom:g}: must be 0 or more; 0 leaves focal lengths as they are")
 

@@ -58,7 +58,7 @@ def cached_frames(
     short_side: int,
     bad: BadFrames,
     cache_dir: Path | None = None,
-    least: tuple[int, int] | None = None,
+    min_size: tuple[int, int] | None = None,
 ) -> FrameCache:
     """Open the cache of some images, building it first if it is missing.
 
@@ -67,20 +67,20 @@ def cached_frames(
         short_side: height or width, whichever is smaller, in pixels, that images are resized to.
         bad: what to do with an image that is missing, truncated, or of another shape than the first.
         cache_dir: where caches are kept.
-        least: of frames of several shapes the middle that all hold is kept, if it has this height and width; unless
+        min_size: of frames of several shapes the middle that all hold is kept, if it has this height and width; unless
             given, another shape than the first is bad.
 
     Raises:
         InputError: for a bad image where ``bad`` says so, no good image at all, or a full disk.
     """
     root = (cache_dir or default_cache_dir()) / "frames"
-    folder = root / _key(paths, short_side, least)
+    folder = root / _key(paths, short_side, min_size)
     if not folder.is_dir():
         try:
             root.mkdir(parents=True, exist_ok=True)
             with FileLock(folder.with_suffix(".lock")):
                 if not folder.is_dir():  # another process may have built it meanwhile
-                    _build(folder, paths, short_side, least)
+                    _build(folder, paths, short_side, min_size)
         except OSError as error:
             message = f"{root}: the frame cache cannot be written ({error}); set MAMBALOC_CACHE elsewhere"
             raise InputError(message) from None
@@ -94,8 +94,8 @@ def cached_frames(
     return FrameCache(images, rows, folder.name, np.array(meta["sizes"], dtype=np.int64))
 
 
-def _key(paths: Sequence[Path], short_side: int, least: tuple[int, int] | None) -> str:
-    digest = hashlib.sha256(f"{_VERSION} {short_side} {least}".encode())
+def _key(paths: Sequence[Path], short_side: int, min_size: tuple[int, int] | None) -> str:
+    digest = hashlib.sha256(f"{_VERSION} {short_side} {min_size}".encode())
     with ThreadPoolExecutor() as pool:
         for path, content in zip(paths, pool.map(fingerprint, paths), strict=True):
             digest.update(f"{path.parent.name}/{path.name}\0".encode())
@@ -103,20 +103,20 @@ def _key(paths: Sequence[Path], short_side: int, least: tuple[int, int] | None) 
     return digest.hexdigest()[:32]
 
 
-def _build(folder: Path, paths: Sequence[Path], short_side: int, least: tuple[int, int] | None) -> None:
+def _build(folder: Path, paths: Sequence[Path], short_side: int, min_size: tuple[int, int] | None) -> None:
     partial = folder.with_suffix(".partial")  # only this process has it: the lock is held
     held: Shape | None = None
     meta: dict[str, Any] | None = None
     while meta is None:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
-        meta, held = _fill(partial / "images.npy", paths, short_side, held, least)
+        meta, held = _fill(partial / "images.npy", paths, short_side, held, min_size)
     (partial / "meta.json").write_text(json.dumps({**meta, "short_side": short_side}))
     partial.replace(folder)
 
 
 def _fill(
-    file: Path, paths: Sequence[Path], short_side: int, held: Shape | None, least: tuple[int, int] | None
+    file: Path, paths: Sequence[Path], short_side: int, held: Shape | None, min_size: tuple[int, int] | None
 ) -> tuple[dict[str, Any] | None, Shape | None]:
     """Decode frames into a file, each cropped to a shape that all hold: the first one's unless given.
 
@@ -136,7 +136,7 @@ def _fill(
             images = np.lib.format.open_memmap(file, mode="w+", dtype=np.uint8, shape=(len(paths), *held))
             claim_space(file)
         common = tuple(map(min, frame.shape, images.shape[1:]))
-        if frame.shape != images.shape[1:] and (least is None or common[1] < least[0] or common[2] < least[1]):
+        if frame.shape != images.shape[1:] and (min_size is None or common[1] < min_size[0] or common[2] < min_size[1]):
             bad.append((row, f"image is {_size(frame)} after resizing, where the first is {_size(images[0])}"))
             continue
         if common != images.shape[1:]:

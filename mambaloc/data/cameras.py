@@ -53,9 +53,9 @@ def known_cameras(dataset: str, folder: Path, frames: Frames) -> Cameras:
     height, width = read_image(frames.image_paths[0]).shape[:2]
     size, nvm, colmap = (width, height), folder / NVM_FILE, colmap_folder(folder)
     if "intrinsics_px" in (note := scene_note(folder)):
-        return _alike(_of_rendering(folder, note["intrinsics_px"]), size, frames)
+        return _repeated(_of_rendering(folder, note["intrinsics_px"]), size, frames)
     if dataset == "7scenes":
-        return _alike(_centered(_SEVEN_SCENES_FOCAL * width, size), size, frames)
+        return _repeated(_centered(_SEVEN_SCENES_FOCAL * width, size), size, frames)
     if nvm.is_file():
         cameras = read_nvm_cameras(nvm)
         focal_px = zip(cameras.names, cameras.focal_px, strict=True)
@@ -88,7 +88,7 @@ def known_or_assumed_cameras(dataset: str, folder: Path, frames: Frames) -> Came
         assumed = f"A focal length of {ASSUMED_FOCAL:g} of the images' longer side is assumed."
         warnings.warn(f"{error} {assumed}", InputWarning, stacklevel=2)
     height, width = read_image(frames.image_paths[0]).shape[:2]
-    return replace(_alike(assumed_intrinsics((width, height)), (width, height), frames), is_assumed=True)
+    return replace(_repeated(assumed_intrinsics((width, height)), (width, height), frames), is_assumed=True)
 
 
 def assumed_intrinsics(size: Size) -> Floats:
@@ -107,8 +107,8 @@ def undistortion_of(folder: Path) -> Undistortion:
     names = {row.camera for row in read_rows(folder) if row.split == "train"}
     if len(names) != 1:
         return Undistortion(unknown=f"they are of {len(names)} cameras")
-    told = read_scene(folder).get("cameras")
-    camera = told.get(*names) if isinstance(told, dict) else None
+    cameras_json = read_scene(folder).get("cameras")
+    camera = cameras_json.get(*names) if isinstance(cameras_json, dict) else None
     if not isinstance(camera, dict):
         return Undistortion(unknown="their scene does not describe their camera")
     if "adjusted_from" in camera:
@@ -129,13 +129,13 @@ def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Floats:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _alike(matrix: Floats, size: Size, frames: Frames) -> Cameras:
+def _repeated(matrix: Floats, size: Size, frames: Frames) -> Cameras:
     return Cameras(np.tile(matrix, (len(frames), 1, 1)), np.tile(size, (len(frames), 1)))
 
 
-def _of_rendering(folder: Path, told: Any) -> Floats:
+def _of_rendering(folder: Path, intrinsics: Any) -> Floats:
     try:
-        matrix = np.array(told, np.float64)
+        matrix = np.array(intrinsics, np.float64)
     except (ValueError, TypeError):
         matrix = np.empty(0)
     is_pinhole = matrix.shape == (3, 3) and np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0
@@ -156,7 +156,7 @@ def _of_model(matrices: dict[str, Floats], model: Path, folder: Path, size: Size
             "Name the model's images by their path in the scene's folder."
         )
     known = sorted((matrices[name] for name in rows), key=lambda matrix: float(matrix[0, 0]))
-    cameras = _alike(known[len(known) // 2], size, frames)
+    cameras = _repeated(known[len(known) // 2], size, frames)
     for name, row in rows.items():
         cameras.intrinsics[row] = matrices[name]
     return cameras
@@ -172,14 +172,14 @@ def _of_colmap(path: Path, size: Size) -> dict[str, Floats]:
 def _of_capture(folder: Path, frames: Frames) -> Cameras:
     camera_of = {row.image: row.camera for row in read_rows(folder)}
     names = [camera_of[image] for image in frames.image_paths]
-    told = read_scene(folder).get("cameras")
-    cameras = {name: _captured(folder / SCENE_FILE, told, name) for name in {*names}}
+    cameras_json = read_scene(folder).get("cameras")
+    cameras = {name: _captured(folder / SCENE_FILE, cameras_json, name) for name in {*names}}
     return Cameras(np.stack([cameras[name][0] for name in names]), np.array([cameras[name][1] for name in names]))
 
 
-def _captured(path: Path, told: Any, name: str) -> tuple[Floats, Size]:
+def _captured(path: Path, cameras_json: Any, name: str) -> tuple[Floats, Size]:
     """Matrix of a camera of ``scene.json``, and size of its images."""
-    camera = told.get(name) if isinstance(told, dict) else None
+    camera = cameras_json.get(name) if isinstance(cameras_json, dict) else None
     if camera is None or (isinstance(camera, dict) and not {"focal_px", "centre_px"} <= set(camera)):
         raise UnknownCameraError(
             f"{path}: has no focal length and centre of camera {name!r}. Import the scene with its intrinsics, "

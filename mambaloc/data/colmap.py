@@ -65,7 +65,7 @@ def load_colmap(path: Path) -> Any:
     """
     pycolmap = import_pycolmap(path)
     for name in ("cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"):  # all before COLMAP reads any
-        if (path / name).is_file() and not _is_whole(name, (path / name).read_bytes()):
+        if (path / name).is_file() and not _is_complete(name, (path / name).read_bytes()):
             raise InputError(f"{path / name}: is truncated; export the model again")
     with readable(path) as (folder, names):
         try:
@@ -111,7 +111,7 @@ def pinhole_of(camera: Any, size_px: tuple[int, int]) -> NDArray[np.float64]:
     return np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
 
 
-def _is_whole(name: str, data: bytes) -> bool:
+def _is_complete(name: str, data: bytes) -> bool:
     """Whether a file holds what it counts: COLMAP believes a count, and fills the memory."""
     try:
         (records,) = struct.unpack_from("<Q", data)

@@ -100,13 +100,15 @@ def _images(path: Path) -> Iterator[tuple[int, list[str], str]]:
 
 def _is_image(line: str) -> bool:
     words = line.split(maxsplit=_BEFORE_NAME)
-    is_like = len(words) > _BEFORE_NAME and _is_whole(words[0]) and _is_whole(words[_BEFORE_NAME - 1])
+    is_like = len(words) > _BEFORE_NAME and _is_integer(words[0]) and _is_integer(words[_BEFORE_NAME - 1])
     return is_like and not _is_points(line.split())
 
 
 def _is_points(words: list[str]) -> bool:
     """Whether a line is one of points, rather than of an image whose name ends in a number."""
-    return len(words) % 3 == 0 and all(map(_is_whole, words[2::3])) and all(map(_is_number, words[: 2 * _BEFORE_NAME]))
+    return (
+        len(words) % 3 == 0 and all(map(_is_integer, words[2::3])) and all(map(_is_number, words[: 2 * _BEFORE_NAME]))
+    )
 
 
 def _is_number(word: str) -> bool:
@@ -117,7 +119,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _is_whole(word: str) -> bool:
+def _is_integer(word: str) -> bool:
     return word.isascii() and word.removeprefix("-").isdecimal()
 
 

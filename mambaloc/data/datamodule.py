@@ -230,14 +230,14 @@ class PoseDataModule(L.LightningDataModule):
 
     def training_key(self) -> str:
         """Name what augmented training images depend on: frames, views, chances and the batches they are mixed in."""
-        told = (
+        settings = (
             self.scene.training_key(),
             self.augmentation,
             self.jitter,
             provenance.seed(),
             self.hparams["batch_size"],
         )
-        return hashlib.sha256(repr(told).encode()).hexdigest()
+        return hashlib.sha256(repr(settings).encode()).hexdigest()
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         """Shuffled training batches; the first call makes views."""

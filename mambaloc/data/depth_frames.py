@@ -30,7 +30,7 @@ def depth_path(image: Path) -> Path:
     return image.with_name(f"{image.name.partition('.')[0]}.depth.png")
 
 
-def read_whole_png(path: Path) -> NDArray[Any] | None:
+def read_complete_png(path: Path) -> NDArray[Any] | None:
     """The numbers of a PNG as they are stored; None where the file cannot be read or is truncated."""
     try:
         data = path.read_bytes()
@@ -45,7 +45,7 @@ def read_depth_mm(path: Path) -> NDArray[np.uint16]:
     Raises:
         InputError: where it is not a complete 16-bit PNG of one channel.
     """
-    depth_mm = read_whole_png(path)
+    depth_mm = read_complete_png(path)
     if depth_mm is None or depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
         raise InputError(f"{path}: is not a complete 16-bit PNG of one channel. Repair or remove it.")
     return depth_mm

@@ -63,16 +63,16 @@ class CachedFrames(Dataset[PoseBatch]):
         """Of all images."""
         return self.images.nbytes
 
-    def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+    def images_at(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Decoded images of some rows, (B, 3, H, W)."""
-        pictures = np.stack([self.images[row] for row in rows])
+        images = np.stack([self.images[row] for row in rows])
         release_pages(self.images)
-        return pictures
+        return images
 
     def to(self, device: torch.device) -> Self:
         """Return the same frames, whole in a device's memory: batches are made there, and nothing is copied to it."""
         there = copy(self)
-        there.resident = torch.from_numpy(self.pictures(range(len(self.position_m)))).to(device)
+        there.resident = torch.from_numpy(self.images_at(range(len(self.position_m)))).to(device)
         for name in ("position_m", "quaternion", "points_m", "intrinsics"):
             if (values := getattr(self, name)) is not None:
                 setattr(there, name, values.to(device))
@@ -83,7 +83,7 @@ class CachedFrames(Dataset[PoseBatch]):
         rows = self.clips[items].ravel()
         index = torch.from_numpy(rows).to(self.position_m.device, non_blocking=True)
         return PoseBatch(
-            torch.from_numpy(self.pictures(rows)) if self.resident is None else self.resident[index],
+            torch.from_numpy(self.images_at(rows)) if self.resident is None else self.resident[index],
             self.position_m[index],
             self.quaternion[index],
             index,

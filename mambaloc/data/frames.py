@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
+from mambaloc.renamed import renamed_arguments
 
 Split = Literal["train", "val", "test"]
 """Imported scenes mark frames for validation; the benchmarks have none."""
@@ -108,9 +109,10 @@ class Frames:
         """Rows by the name that a model in the scene's folder knows the images by: :func:`plain_name` of their path."""
         return {plain_name(path.relative_to(folder).as_posix()): row for row, path in enumerate(self.image_paths)}
 
-    def evenly_spread(self, most: int) -> list[int]:
+    @renamed_arguments(most="count")
+    def evenly_spread(self, count: int) -> list[int]:
         """Indices of at most so many frames, evenly spread from the first to the last."""
-        return np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int).tolist()
+        return np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int).tolist()
 
     def by_sequence(self) -> dict[str, NDArray[np.int64]]:
         """Indices of each sequence's frames, in order of first appearance."""

@@ -159,8 +159,8 @@ def _shares(sizes: list[int], batch_size: int) -> list[int]:
     """Share a batch out in proportion to sizes, at least one each: whole numbers that sum to ``batch_size``."""
     shares = [1] * len(sizes)
     for _ in range(batch_size - len(sizes)):  # to whom is owed most, as Jefferson's method has it
-        most = max(range(len(sizes)), key=lambda index: sizes[index] / (shares[index] + 1))
-        shares[most] += 1
+        owed = max(range(len(sizes)), key=lambda index: sizes[index] / (shares[index] + 1))
+        shares[owed] += 1
     return shares
 
 

@@ -110,7 +110,7 @@ class Scene:
             InputError: if there is no such scene, or for a bad frame under ``on_bad_frame: error``.
         """
         bad = BadFrames(self.on_bad_frame)
-        folder = self.folder  # first of all: an unknown dataset is told here
+        folder = self.folder  # first of all: raises for an unknown dataset
         frames = DATASETS[self.dataset].read_split(folder, split, bad)
         self._listed[split] = len(frames) + len(bad.rejected)
         return frames, bad

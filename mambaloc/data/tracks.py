@@ -17,7 +17,7 @@ from mambaloc.errors import InputError
 
 POINTS_FILE = "points.safetensors"
 """What an imported scene calls them."""
-_MOST_BYTES = 2**31
+_MAX_BYTES = 2**31
 _ARRAYS = {"points_m": (np.float64, 3), "point": (np.int64, 0), "frame": (np.int64, 0), "rays": (np.float64, 2)}
 
 
@@ -71,8 +71,8 @@ def read_tracks(folder: Path, frames: int) -> Tracks | None:
     if not path.is_file():
         return None
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"it is larger than {_MOST_BYTES} bytes")
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"it is larger than {_MAX_BYTES} bytes")
         arrays = load(path.read_bytes())
         _check(arrays, frames)
         return Tracks(*(arrays[name] for name in _ARRAYS))

@@ -17,6 +17,7 @@ from typing import Any
 from mambaloc.demo.lan import lan_address, qr_code, self_signed
 from mambaloc.demo.site import build_site
 from mambaloc.errors import InputError
+from mambaloc.renamed import renamed_arguments
 
 LOOPBACK = "127.0.0.1"
 _TYPES = {".js": "text/javascript", ".mjs": "text/javascript", ".wasm": "application/wasm", ".webm": "video/webm"}
@@ -35,12 +36,13 @@ _HEADERS = {
 }
 
 
-def serve_page(bundle: Path, film: Path | None, port: int, lan: bool) -> None:
+@renamed_arguments(film="video")
+def serve_page(bundle: Path, video: Path | None, port: int, lan: bool) -> None:
     """Build the page of a bundle, say where it is, and serve it until Ctrl-C or the process is asked to end.
 
     Args:
         bundle: as :func:`~mambaloc.demo.site.build_site` takes it.
-        film: a video for the page to play, or the folder of a video with poses.
+        video: a video for the page to play, or the folder of a video with poses.
         port: as :func:`serve` takes it.
         lan: serve the local network by HTTPS, and print the address as a code to scan, too.
 
@@ -50,10 +52,10 @@ def serve_page(bundle: Path, film: Path | None, port: int, lan: bool) -> None:
     host = lan_address() if lan else LOOPBACK
     tls = self_signed(host) if lan else None
     code = qr_code if lan else (lambda _: "")
-    code("")  # so that a package that is not there is told before the page is built
+    code("")  # so that a missing package is reported before the page is built
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # as Ctrl-C does, leave nothing behind
     with TemporaryDirectory() as folder:
-        site = build_site(bundle, Path(folder, "site"), film)
+        site = build_site(bundle, Path(folder, "site"), video)
         with serve(site, port, host, tls) as server, suppress(KeyboardInterrupt):
             url = f"{'https' if tls else 'http'}://{host}:{server.server_port}/"
             print(f"{code(url)}{url}  (Ctrl-C ends)", flush=True)

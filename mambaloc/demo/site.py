@@ -15,22 +15,24 @@ from rich.console import Console
 
 from mambaloc.demo.video import POSES_FILE, VIDEO_FILE
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
+from mambaloc.renamed import renamed_arguments
 from mambaloc.runtime.bundle import CONTRACT_FILE, verify_bundle
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 _WEB = files("mambaloc.demo") / "web"
 _VENDORED = "vendor.json"  # the site's files that come from npm, and where they lie in node_modules
 _NPM_FILES = ("package.json", "package-lock.json", ".npmrc")
 
 
-def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
+@renamed_arguments(film="video")
+def build_site(bundle: Path, out: Path, video: Path | None = None) -> Path:
     """Write the page for a bundle; the folder appears once it is whole.
 
     Args:
         bundle: which :func:`~mambaloc.runtime.bundle.verify_bundle` finds as it was written.
         out: the folder, which must not be there yet.
-        film: a video for the page to play, or what :func:`embedded_video` gives.
+        video: a video for the page to play, or what :func:`embedded_video` gives.
 
     Raises:
         InputError: for an invalid bundle or video, a folder that cannot be written, or without Node.js's npm.
@@ -39,7 +41,7 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
     if out.exists():
         raise InputError(f"{out}: already exists; choose another folder with --out, or remove it")
     modules = node_modules()
-    with whole_folder(out, "choose another folder with --out") as site:
+    with atomic_folder(out, "choose another folder with --out") as site:
         with as_file(_WEB) as web:
             shutil.copytree(web, site, dirs_exist_ok=True, ignore=shutil.ignore_patterns(_VENDORED, *_NPM_FILES))
         for name, source in json.loads((_WEB / _VENDORED).read_text(encoding="utf-8")).items():
@@ -48,7 +50,7 @@ def build_site(bundle: Path, out: Path, film: Path | None = None) -> Path:
         for name in _listed(bundle):
             (site / "bundle" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(bundle / name, site / "bundle" / name)
-        _add_video(site, film)
+        _add_video(site, video)
     return out
 
 
@@ -63,7 +65,7 @@ def node_modules(dev: bool = False) -> Path:
     """
     lock = (_WEB / "package-lock.json").read_bytes()
     name = hashlib.sha256(lock).hexdigest()[:12] + ("-dev" if dev else "")
-    return made_once(f"node/{name}", partial(_install, dev=dev)) / "node_modules"
+    return cached_folder(f"node/{name}", partial(_install, dev=dev)) / "node_modules"
 
 
 def _install(folder: Path, dev: bool) -> None:
@@ -85,15 +87,15 @@ def _listed(bundle: Path) -> list[str]:
     return [CONTRACT_FILE, *contract["files"]]
 
 
-def _add_video(site: Path, film: Path | None) -> None:
-    if film is None:
+def _add_video(site: Path, video: Path | None) -> None:
+    if video is None:
         (site / POSES_FILE).write_text("null\n", encoding="utf-8")  # there is none
-    elif (film / POSES_FILE).is_file():
+    elif (video / POSES_FILE).is_file():
         for name in (VIDEO_FILE, POSES_FILE):
-            shutil.copyfile(film / name, site / name)
-    elif film.is_file() and cv2.VideoCapture(str(film)).read()[0]:
-        file = f"film{film.suffix.lower()}"
-        shutil.copyfile(film, site / file)
+            shutil.copyfile(video / name, site / name)
+    elif video.is_file() and cv2.VideoCapture(str(video)).read()[0]:
+        file = f"film{video.suffix.lower()}"
+        shutil.copyfile(video, site / file)
         (site / POSES_FILE).write_text(json.dumps({"file": file}) + "\n", encoding="utf-8")
     else:
-        raise InputError(f"{film}: no video that browsers play; give an MP4 or WebM")
+        raise InputError(f"{video}: no video that browsers play; give an MP4 or WebM")

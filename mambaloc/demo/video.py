@@ -16,7 +16,7 @@ from rich.progress import track
 from mambaloc.errors import InputError
 from mambaloc.rendering import GENERATOR_VERSION, default_intrinsics, embedded_room, embedded_walk, render, sensor
 from mambaloc.runtime.rotations import quaternion_from_matrix
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 VIDEO_FILE, POSES_FILE = "film.webm", "film.json"
 _FRAMES, _FPS, _SEED = 240, 15, 7
@@ -31,7 +31,7 @@ def embedded_video() -> Path:
     Raises:
         InputError: where the cache cannot be written, or OpenCV came without VP8.
     """
-    return made_once(f"films/embedded-{GENERATOR_VERSION}", _take)
+    return cached_folder(f"films/embedded-{GENERATOR_VERSION}", _take)
 
 
 def _take(folder: Path) -> None:
@@ -49,8 +49,8 @@ def _take(folder: Path) -> None:
     if (taken := int(cv2.VideoCapture(str(folder / VIDEO_FILE)).get(cv2.CAP_PROP_FRAME_COUNT))) != _FRAMES:
         raise InputError(f"{folder.parent}: only {taken} of {_FRAMES} video frames were written. Free some disk space.")
     poses = [[*pose[:3, 3], *quaternion_from_matrix(pose[:3, :3])] for pose in walk]
-    told = {"file": VIDEO_FILE, "fps": _FPS, "poses": np.round(poses, 5).tolist()}
-    (folder / POSES_FILE).write_text(json.dumps(told) + "\n", encoding="utf-8")
+    content = {"file": VIDEO_FILE, "fps": _FPS, "poses": np.round(poses, 5).tolist()}
+    (folder / POSES_FILE).write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from mambaloc.evaluation.evaluate import median_intervals
 from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.evaluation.trained import Trained
 from mambaloc.metrics import PoseErrorTable, summarize
-from mambaloc.viz.curves import Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
+from mambaloc.viz.curves import Point, axis_limit, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
 from mambaloc.viz.png import write_png
 
 _ERRORS = {"position_error_m": "position error (m)", "rotation_error_deg": "rotation error (°)"}
@@ -31,7 +31,7 @@ def draw_cumulative(trained: Sequence[Trained], path: Path, title: str) -> None:
         errors = {name: _joined(of, error) for name, of in tables.items()}
         plot_cumulative(axes, errors)
         axes.set(xlabel=_ERRORS[error], ylabel="share of test frames")
-        axes.set(xlim=(0, most_shown(errors.values())), ylim=(0, 1))
+        axes.set(xlim=(0, axis_limit(errors.values())), ylim=(0, 1))
 
     _write(draw, path, title)
 
@@ -78,7 +78,7 @@ def draw_sparsity(trained: Sequence[Trained], path: Path, title: str) -> None:
             known[frames] = _points(each, frames)
 
     def draw(axes: Axes, error: str) -> None:
-        plot_errors_by_frames(axes, {name: [told[error] for told in of.values()] for name, of in points.items()})
+        plot_errors_by_frames(axes, {name: [point[error] for point in of.values()] for name, of in points.items()})
         axes.set(xlabel="training frames", ylabel=f"median {_ERRORS[error]}")
         axes.set_ylim(bottom=0)
 

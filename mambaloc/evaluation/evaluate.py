@@ -20,7 +20,7 @@ from mambaloc.evaluation.references import frozen_features, median_training_pose
 from mambaloc.evaluation.trained import Trained, load_trained
 from mambaloc.evaluation.trajectories import write_predictions
 from mambaloc.evaluation.with_map import Answers, MeasuredMap
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.metrics import PoseErrorTable, summarize
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.models.weights import mib, parameter_count
@@ -62,7 +62,7 @@ def evaluate_checkpoint(
             cannot be written.
     """
     if rerun is not None:
-        check_recording(rerun)  # told now rather than once all is computed
+        check_recording(rerun)  # fails now rather than once all is computed
     trained = load_trained(checkpoint, data)
     system, data = trained.system, trained.data
     backbone = _first_backbone(checkpoint) if with_retrieval else None
@@ -146,7 +146,7 @@ def _write(out: Path, result: dict[str, Any], table: PoseErrorTable, both: Answe
     frames, world = trained.data.frames("test"), trained.data.world
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        with whole_file(out / "metrics.json") as partial:
+        with atomic_file(out / "metrics.json") as partial:
             partial.write_text(json.dumps(_finite(result), indent=2) + "\n", encoding="utf-8")
         write_predictions(out / "predictions.csv", table, frames, world)
         true_m = world.position_m(table.true_position_m.cpu())

@@ -22,7 +22,7 @@ from mambaloc.viz.scene_page import write_scene_page
 from mambaloc.viz.top_view import draw_top_view
 from mambaloc.viz.trajectory import draw_trajectory
 
-MOST_FRAMES = 12
+MAX_FRAMES = 12
 """Frames side by side in one figure."""
 
 _OUTDOORS = {"cambridge"}
@@ -44,10 +44,10 @@ def draw_figures(kind: str, trained: Sequence[Trained], out: Path, frames: int =
         InputError: for frames that are not there, systems that do not go into one figure, or a folder that cannot be
             written.
     """
-    if not 1 <= frames <= MOST_FRAMES:
-        raise InputError(f"--frames {frames}: must be 1 to {MOST_FRAMES}")
+    if not 1 <= frames <= MAX_FRAMES:
+        raise InputError(f"--frames {frames}: must be 1 to {MAX_FRAMES}")
     with writing(out):
-        out.mkdir(parents=True, exist_ok=True)  # told now rather than once all is computed
+        out.mkdir(parents=True, exist_ok=True)  # fails now rather than once all is computed
     return FIGURES[kind](trained, out, frames)
 
 
@@ -55,16 +55,16 @@ def _trajectory(trained: Sequence[Trained], out: Path, frames: int) -> list[Path
     """An image and a page a system, of every test frame."""
     written = []
     for number, each in enumerate(trained, start=1):
-        table, told = localize_test_frames(each.system, each.data), each.data.frames("test")
+        table, test_frames = localize_test_frames(each.system, each.data), each.data.frames("test")
         stem = "trajectory" if len(trained) == 1 else f"trajectory_{number}"
-        picture, page = out / f"{stem}.png", out / f"{stem}.html"
+        plot, page = out / f"{stem}.png", out / f"{stem}.html"
         title = f"{each.name}, {each.run}\n{_where(each.data)}"
         draw = draw_top_view if each.data.hparams["dataset"] in _OUTDOORS else draw_trajectory
-        names = [f"{path.parent.name}/{path.name}" for path in told.image_paths]
+        names = [f"{path.parent.name}/{path.name}" for path in test_frames.image_paths]
         with writing(out):
-            draw(table, told.sequences, picture, title)
-            write_scene_page(table, told.sequences, names, page, title)
-        written += [picture, page]
+            draw(table, test_frames.sequences, plot, title)
+            write_scene_page(table, test_frames.sequences, names, page, title)
+        written += [plot, page]
     return written
 
 
@@ -163,6 +163,7 @@ def _beside(trained: Trained) -> str:
 
 
 def _where(data: PoseDataModule) -> str:
-    told = data.describe()
-    split = "official split" if told["official_split"] else "not an official benchmark split"
-    return f"{told['dataset']}/{told['scene']}, test{' (rendered)' if told['rendered'] else ''}, {split}"
+    description = data.describe()
+    split = "official split" if description["official_split"] else "not an official benchmark split"
+    rendered = " (rendered)" if description["rendered"] else ""
+    return f"{description['dataset']}/{description['scene']}, test{rendered}, {split}"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mambaloc.data import Frames
-from mambaloc.files import whole_file
+from mambaloc.files import atomic_file
 from mambaloc.metrics import PoseErrorTable
 from mambaloc.runtime.trajectory import decimal, write_tum
 from mambaloc.runtime.world import World
@@ -32,7 +32,7 @@ def write_predictions(
     predicted_m, true_m = (world.position_m(each.cpu()) for each in (table.predicted_position_m, table.true_position_m))
     header = ["index", "image", *(f"predicted_{c}" for c in pose), *(f"true_{c}" for c in pose)]
     header += ["position_error_m", "rotation_error_deg", *(["source"] if sources else [])]
-    with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+    with atomic_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         for row, index in enumerate(table.index.tolist()):

@@ -94,15 +94,15 @@ class MeasuredMap:
                 map does not accept every pose.
         """
         poses = (network.predicted_position_m.cpu().numpy(), network.predicted_quaternion.cpu().numpy())
-        said = [Localization(position_m, quaternion, 0.0) for position_m, quaternion in zip(*poses, strict=True)]
-        priors = [CameraPose.from_quaternion(each.quaternion, each.position_m) for each in said]
+        predicted = [Localization(position_m, quaternion, 0.0) for position_m, quaternion in zip(*poses, strict=True)]
+        priors = [CameraPose.from_quaternion(each.quaternion, each.position_m) for each in predicted]
         found, cpu_s = localize_frames(self.localizer, self.frames.image_paths, self.intrinsics, priors)
         if not all(each.is_accepted for each in found) and (stated := uncertainty()) is not None:
-            said = [
+            predicted = [
                 replace(each, position_radius_m=radius_m, rotation_radius_deg=radius_deg, unfamiliarity=unfamiliarity)
-                for each, (radius_m, radius_deg, unfamiliarity) in zip(said, stated.by_frame(), strict=True)
+                for each, (radius_m, radius_deg, unfamiliarity) in zip(predicted, stated.by_frame(), strict=True)
             ]
-        answers = [combined(*both) for both in zip(said, found, strict=True)]
+        answers = [combined(*both) for both in zip(predicted, found, strict=True)]
         return Answers.of(answers, self.frames, cpu_s)
 
     def describe(self) -> dict[str, Any]:

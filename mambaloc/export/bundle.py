@@ -24,7 +24,7 @@ from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.export.quantization import QuantizedModel, eight_bit
-from mambaloc.files import sha256, whole_folder
+from mambaloc.files import atomic_folder, sha256
 from mambaloc.geometry import canonical
 from mambaloc.images import Image, read_image
 from mambaloc.models import LitPoseRegressor
@@ -91,7 +91,7 @@ def write_bundle(
         raise InputError(f"{what}, and this network knows {len(scenes)}. Leave it out.")
     data.setup("test")
     status = Console(stderr=True).status(f"exporting {system.registry_name}")
-    with status, whole_folder(out, "choose another folder with --out") as partial:
+    with status, atomic_folder(out, "choose another folder with --out") as partial:
         try:
             uncertainty, unsure = fit_uncertainty(system, data), None
         except InputError as error:
@@ -146,7 +146,7 @@ def _write_models(
         models["int8"] = int8.model
     for name, each in models.items():
         whole = with_preprocessing(each, contract.preprocessing, focal_px) if raw_input else each
-        _tell(whole, contract)
+        _write_metadata(whole, contract)
         onnx.save(whole, folder / MODEL_FILES[name])
     if "ort" in formats:
         write_ort(network, folder / MODEL_FILES["ort"])
@@ -155,7 +155,7 @@ def _write_models(
     return contract, int8
 
 
-def _tell(model: onnx.ModelProto, contract: Contract) -> None:
+def _write_metadata(model: onnx.ModelProto, contract: Contract) -> None:
     del model.metadata_props[:]
     model.metadata_props.add(key=METADATA_KEY, value=contract.to_json())
 
@@ -172,19 +172,19 @@ def _write_frames(
     For a system that takes intrinsics there is one of another lens besides: a part of the first frame, not its middle.
     As PNG: no two decoders agree on a JPEG.
     """
-    pictures, cameras = [], np.empty((0, 3, 3))
+    images, cameras = [], np.empty((0, 3, 3))
     for each in data.each_scene():
         frames = each.frames("test")
         rows = frames.evenly_spread(max(1, _FRAMES // len(data.each_scene())))
-        pictures += [read_image(frames.image_paths[row]) for row in rows]
+        images += [read_image(frames.image_paths[row]) for row in rows]
         cameras = np.concatenate([cameras, each.scene.parts["test"].data.cameras.intrinsics[rows]])
     if contract.intrinsics is not None:
-        left = pictures[0].shape[1] // 8
-        pictures.append(pictures[0][:, left:])
+        left = images[0].shape[1] // 8
+        images.append(images[0][:, left:])
         cameras = np.concatenate([cameras, cameras[:1] - [[0, 0, left], [0, 0, 0], [0, 0, 0]]])
     (folder / "frames").mkdir()
-    told: list[dict[str, Any]] = []
-    for number, (rgb, intrinsics) in enumerate(zip(pictures, cameras, strict=True)):
+    entries: list[dict[str, Any]] = []
+    for number, (rgb, intrinsics) in enumerate(zip(images, cameras, strict=True)):
         copy = f"frames/{number}.png"
         (folder / copy).write_bytes(cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
         described = {"file": copy, **_network_vector(system, contract, rgb, intrinsics)}
@@ -192,8 +192,8 @@ def _write_frames(
             described["intrinsics"] = intrinsics.tolist()
         if in_map is not None:
             described["map"] = map_vector(in_map, rgb, intrinsics)
-        told.append(described)
-    return told
+        entries.append(described)
+    return entries
 
 
 def _network_vector(

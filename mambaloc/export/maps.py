@@ -13,7 +13,7 @@ from mambaloc.data.frames import Frames
 from mambaloc.errors import InputError
 from mambaloc.images import Image, read_image
 from mambaloc.runtime.maps import MAP_FILE, MapLocalizer, SparseMap
-from mambaloc.runtime.maps.acceptance import CALIBRATION, LEAST_PROBABILITY, MOST_DEVIATION, RULE
+from mambaloc.runtime.maps.acceptance import CALIBRATION, MAX_DEVIATION, MIN_PROBABILITY, RULE
 from mambaloc.runtime.maps.radii import LEVEL
 from mambaloc.runtime.maps.viewpoints import spread_m
 from mambaloc.runtime.rotations import rotation_error_deg
@@ -44,10 +44,10 @@ def check_scene(path: Path, sparse_map: SparseMap, data: PoseDataModule) -> None
         return
     frames = listed.select(np.array(listed.evenly_spread(_CHECKED)))
     localizer, found = MapLocalizer(sparse_map), 0
-    most_m = _ELSEWHERE[0] * spread_m(sparse_map.key_poses)
+    max_distance_m = _ELSEWHERE[0] * spread_m(sparse_map.key_poses)
     for row, intrinsics in enumerate(scene_intrinsics(data, frames)):
         pose = localizer.localize(read_image(frames.image_paths[row]), intrinsics)
-        near = np.linalg.norm(pose.position_m - frames.position_m[row]) <= most_m
+        near = np.linalg.norm(pose.position_m - frames.position_m[row]) <= max_distance_m
         turned_deg = rotation_error_deg(pose.quaternion, frames.quaternion[row])
         found += bool(pose.is_accepted and near and turned_deg <= _ELSEWHERE[1])
     if 2 * found < len(frames):
@@ -74,8 +74,8 @@ def describe_map(sparse_map: SparseMap) -> dict[str, Any]:
         "key_frames": len(sparse_map.key_poses),
         "accepted": {
             "rule": RULE,
-            "least_probability": LEAST_PROBABILITY,
-            "most_deviation": MOST_DEVIATION,
+            "least_probability": MIN_PROBABILITY,
+            "most_deviation": MAX_DEVIATION,
             "least_inliers": sparse_map.least_inliers,
             "calibrated_on": CALIBRATION,
         },

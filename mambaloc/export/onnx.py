@@ -21,7 +21,7 @@ from typing_extensions import deprecated
 
 from mambaloc.data import MultiSceneDataModule, PoseDataModule
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.models import LitPoseRegressor
 from mambaloc.nn import PoseNetwork, PositionScale
@@ -119,7 +119,7 @@ def export_onnx(
         InputError: where ONNX Runtime disagrees with PyTorch, or the file cannot be written.
     """
     deployed = DeployedNetwork(copy.deepcopy(system.network).cpu().float(), uncertainty).eval()
-    with writing(path, "choose another folder"), whole_file(path) as partial:
+    with writing(path, "choose another folder"), atomic_file(path) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(deployed, contract, partial)
         parity = check_parity(deployed, partial, system.image_size)
@@ -211,8 +211,8 @@ def check_parity(deployed: DeployedNetwork, path: Path, image_size: tuple[int, i
         inputs = _random_inputs(deployed.network, batch, image_size, generator)
         with torch.inference_mode():
             expected_m, expected_q, *expected = deployed(**inputs)
-        said = session.run(None, {name: tensor.numpy() for name, tensor in inputs.items()})
-        actual_m, actual_q, *actual = map(torch.from_numpy, said)
+        outputs = session.run(None, {name: tensor.numpy() for name, tensor in inputs.items()})
+        actual_m, actual_q, *actual = map(torch.from_numpy, outputs)
         position_m.append((actual_m - expected_m).norm(dim=-1).max())
         rotation_deg.append(rotation_error_deg(actual_q, expected_q).max())
         max_norm_m.append(expected_m.norm(dim=-1).max())

@@ -133,15 +133,16 @@ resized ones with both scaled: in Python, `Localizer.localize(picture, is_distor
 
 
 def _uncertainty(contract: Contract) -> str:
-    told = contract.uncertainty
-    if told is None:
+    calibration = contract.uncertainty
+    if calibration is None:
         return (
             "The models do not estimate it: too few frames are known to have been held out of their training to "
             "measure it on."
         )
     return (
-        f"Beside the pose the models say `position_radius_m` and `rotation_radius_deg`: {told['level']:.0%} of the "
-        f"{told['held_out_frames']} frames that were held out of training are within these of their true poses. "
+        f"Beside the pose the models say `position_radius_m` and `rotation_radius_deg`: {calibration['level']:.0%} of "
+        f"the {calibration['held_out_frames']} frames that were held out of training are within these of their true "
+        "poses. "
         "`unfamiliarity` over 1 means that the image hardly looks like the place: do not use its pose."
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import onnx
 
-from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, MOST_ENLARGED, RAW_INPUT, Preprocessing
+from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, MAX_ENLARGEMENT, RAW_INPUT, Preprocessing
 
 _PREFIX = "preprocessing_"  # of the names inside
 
@@ -133,7 +133,7 @@ _CROP_OF_CAMERA = """
 
 
 def _camera_constants(preprocessing: Preprocessing, focal_px: float) -> str:
-    largest = float(MOST_ENLARGED * preprocessing.short_side)
+    largest = float(MAX_ENLARGEMENT * preprocessing.short_side)
     return f"""
             float focal = {{{focal_px}}}, float largest = {{{largest}}}, float half = {{0.5}}, int64[1] nine = {{9}},
             float[1] ones = {{1.0}}, float[1] nones = {{0.0}}, float[1, 3] last = {{0.0, 0.0, 1.0}},

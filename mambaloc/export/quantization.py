@@ -57,8 +57,12 @@ class QuantizedModel:
 
     def __str__(self) -> str:
         errors = f"median {self.position_error_m:.3f} m and {self.rotation_error_deg:.2f}° on {self.frames} test frames"
-        said = f"int8 ({self.kind}): {errors}, {self.loss:+.1%} on float32's at most"
-        return said if self.within_tolerance else f"{said}; {LARGEST_LOSS:.0%} is allowed, so it was left out; use fp16"
+        summary = f"int8 ({self.kind}): {errors}, {self.loss:+.1%} on float32's at most"
+        return (
+            summary
+            if self.within_tolerance
+            else f"{summary}; {LARGEST_LOSS:.0%} is allowed, so it was left out; use fp16"
+        )
 
 
 def eight_bit(model: onnx.ModelProto, data: PoseDataModule) -> QuantizedModel:

@@ -18,7 +18,7 @@ from mambaloc.data.cameras import UnknownCameraError, known_cameras
 from mambaloc.data.datasets.capture import CAPTURE, Row, read_rows, read_scene, read_split, world_of
 from mambaloc.data.frames import BadFrames, Frames
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.images import CORNER_PX, stored_size
 from mambaloc.importing.formats.kapture import SPLITS
 from mambaloc.runtime.rotations import conjugate, matrix_from_quaternion
@@ -60,7 +60,7 @@ def write_kapture(scene: Path, out: Path) -> tuple[dict[str, int], int]:
         raise InputError(f"{bad}: has a comma in its path, which kapture reads as the end of a value. Rename it.")
     stamps, sensors = _stamps(rows), Sensors()
     counts = {}
-    with whole_folder(out, "choose another folder with --out") as partial:
+    with atomic_folder(out, "choose another folder with --out") as partial:
         for name, split in used.items():
             frames = read_split(scene, split, BadFrames())
             _write_part(partial / name / "sensors", scene, frames, stamps, sensors)
@@ -79,15 +79,17 @@ def _stamps(rows: Sequence[Row]) -> Stamps:
 
 def _write_part(folder: Path, scene: Path, frames: Frames, stamps: Stamps, sensors: Sensors) -> None:
     """Write a split as the ``sensors`` of a kapture."""
-    told = _cameras(scene, frames)
-    ids = [sensors.setdefault(each, f"camera-{len(sensors) + 1}") for each in told]
+    of_frames = _cameras(scene, frames)
+    ids = [sensors.setdefault(each, f"camera-{len(sensors) + 1}") for each in of_frames]
     keys = [f"{stamps[image]}, {sensor}" for image, sensor in zip(frames.image_paths, ids, strict=True)]
     names = [image.relative_to(scene).as_posix() for image in frames.image_paths]
     cam_from_world = conjugate(frames.quaternion)
     position = world_of(scene).position_m(frames.position_m)
     translation = -np.einsum("nij,nj->ni", matrix_from_quaternion(cam_from_world), position)
     poses = np.concatenate((cam_from_world, translation), axis=1)
-    cameras = [f"{number}, , camera, {', '.join(each)}" for each, number in dict(zip(told, ids, strict=True)).items()]
+    cameras = [
+        f"{number}, , camera, {', '.join(each)}" for each, number in dict(zip(of_frames, ids, strict=True)).items()
+    ]
     records = [f"{key}, {name}" for key, name in zip(keys, names, strict=True)]
     trajectory = [f"{key}, {_joined(pose)}" for key, pose in zip(keys, poses, strict=True)]
     folder.mkdir(parents=True)

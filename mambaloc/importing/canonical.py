@@ -113,7 +113,7 @@ def write_scene(imported: Imported, folder: Path, source: Path, command: str) ->
     for name, scale in imported.focal.items():
         focal_px = [scale * each for each in capture.cameras[name].focal_px]
         cameras[_adjusted(name)] = {**cameras[name], "focal_px": focal_px, "adjusted_from": name}
-    told = {
+    content = {
         VERSION_KEY: VERSION,
         "imported": {
             "source": str(source),
@@ -138,7 +138,7 @@ def write_scene(imported: Imported, folder: Path, source: Path, command: str) ->
             "verdict": str(imported.verdict),
             "checks": {
                 finding.name: {
-                    "found": finding.said,
+                    "found": finding.message,
                     **({"concern": finding.concern} if finding.concern else {}),
                     **finding.figures,
                 }
@@ -147,7 +147,7 @@ def write_scene(imported: Imported, folder: Path, source: Path, command: str) ->
         },
         "split": _split(imported),
     }
-    (folder / SCENE_FILE).write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / SCENE_FILE).write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _adjusted(camera: str) -> str:
@@ -156,17 +156,17 @@ def _adjusted(camera: str) -> str:
 
 
 def _described(camera: Camera, lens: Camera) -> dict[str, Any]:
-    told = numbers_to_json(camera.size, camera.focal_px, camera.center_px)
+    pinhole = numbers_to_json(camera.size, camera.focal_px, camera.center_px)
     if lens.distorted is None:
         images = "as they were" if lens.size == camera.size else f"the middle of {lens.width}x{lens.height}"
-        return {**told, "images": f"{images}: the camera is a pinhole", "model": lens.model}
+        return {**pinhole, "images": f"{images}: the camera is a pinhole", "model": lens.model}
     was = {"model": lens.model, **numbers_to_json(lens.size, lens.focal_px, lens.center_px)}
     if isinstance(lens.distorted, CameraModel):
         was |= model_to_json(lens.distorted, lens.size)
     else:
         was |= {"opencv": None, "unknown": f"its model, {lens.model}, is not one of OpenCV's"}
     zoom = camera.focal_px[0] / lens.focal_px[0]
-    return {**told, "images": f"distortion removed; zoomed by {zoom:.4f}, so that no border is black", "lens": was}
+    return {**pinhole, "images": f"distortion removed; zoomed by {zoom:.4f}, so that no border is black", "lens": was}
 
 
 def _split(imported: Imported) -> dict[str, Any]:

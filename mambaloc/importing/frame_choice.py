@@ -24,7 +24,7 @@ NEAR, FAR = 0.025, 0.05
 
 _SIDE_PX = 240  # frames are compared at this size: what a hand's shake blurs, shows
 _POINTS = 300
-_LEAST_TRACKED = 0.3
+_MIN_TRACKED = 0.3
 _RETURNS_PX = 1.0
 
 
@@ -92,6 +92,6 @@ class Reference:
         back, is_back, _ = cv2.calcOpticalFlowPyrLK(other, self.grey, moved, None)  # type: ignore[call-overload]
         returns = np.linalg.norm(back - self.points, axis=2)[:, 0] < _RETURNS_PX
         kept = (is_found[:, 0] == 1) & (is_back[:, 0] == 1) & returns
-        if kept.mean() < _LEAST_TRACKED:
+        if kept.mean() < _MIN_TRACKED:
             return float("inf")
         return float(np.median(np.linalg.norm(moved - self.points, axis=2)[kept, 0])) / self.grey.shape[1]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.importing.canonical import Imported, write_frames, write_scene
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.checks import sanity
@@ -24,7 +24,7 @@ from mambaloc.importing.splits.selection import ASKED, SelectedSplit, SplitCandi
 from mambaloc.importing.undistort.images import Written, write_images
 from mambaloc.importing.world import in_its_world
 
-_MOST_SCALE = 1e6
+_MAX_SCALE = 1e6
 
 
 def import_scene(
@@ -59,14 +59,14 @@ def import_scene(
         raise InputError(f"{out}: already exists; remove it, or choose another --out")
     if split not in ASKED:
         raise InputError(f"--split {split}: choose one of {', '.join(ASKED)}")
-    if metres_per_unit is not None and not 1 / _MOST_SCALE <= metres_per_unit <= _MOST_SCALE:
+    if metres_per_unit is not None and not 1 / _MAX_SCALE <= metres_per_unit <= _MAX_SCALE:
         raise InputError(
-            f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MOST_SCALE:g} to {_MOST_SCALE:g}"
+            f"--metres-per-unit {metres_per_unit}: give a number from {1 / _MAX_SCALE:g} to {_MAX_SCALE:g}"
         )
     capture = read_capture(source, kind, images, topics)
     named = capture.left_out
     capture, lost = in_its_world(capture, metres_per_unit)
-    with whole_folder(out, "choose another folder with --out") as partial:
+    with atomic_folder(out, "choose another folder with --out") as partial:
         written = write_images(capture, partial)
         imported = _checked(written, {**named, **lost, **written.rules}, split, with_adjusted)
         write_frames(imported, partial)

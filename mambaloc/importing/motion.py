@@ -17,8 +17,8 @@ _JUMP_STEPS = 10.0
 _JUMP_SHARE = 0.02  # of the extent: a camera that hardly moves makes no jumps
 _JUMP_DEG = 45.0
 _LONGEST_STEP = 0.25  # of the extent: a path's steps are shorter; two frames drawn at random lie farther apart
-_LEAST_STEP = 1e-4  # of the extent
-_LEAST_DEG = 0.05
+_MIN_STEP = 1e-4  # of the extent
+_MIN_DEG = 0.05
 _PAIRS_AT_ONCE = 1 << 20
 
 
@@ -72,8 +72,8 @@ def motion_of(capture: Capture) -> Motion:
         length,
         turn_deg,
         extent,
-        max(step, _LEAST_STEP * extent, 1e-12),
-        max(step_deg, _LEAST_DEG),
+        max(step, _MIN_STEP * extent, 1e-12),
+        max(step_deg, _MIN_DEG),
         in_order,
         later[jumps] if in_order else later[:0],
     )
@@ -90,7 +90,7 @@ def quaternions(capture: Capture) -> Floats:
     return quaternion_from_matrix(capture.world_from_cam[:, :3, :3])
 
 
-def apart(
+def pairwise_distances(
     position: Floats, quaternion: Floats, rows: NDArray[np.int64], others: NDArray[np.int64]
 ) -> tuple[Floats, Floats]:
     """How far each of some frames is from each of others: lengths and degrees, (R, O) each."""
@@ -109,7 +109,9 @@ def _to_nearest(position: Floats, quaternion: Floats) -> tuple[float, float]:
     lengths, turns = [], []
     everything = np.arange(len(position))
     for row in everything[:: max(1, len(everything) // 1000)]:
-        length, turn_deg = (each[0] for each in apart(position, quaternion, everything[row : row + 1], everything))
+        length, turn_deg = (
+            each[0] for each in pairwise_distances(position, quaternion, everything[row : row + 1], everything)
+        )
         length[row] = np.inf
         nearest = int(length.argmin())
         lengths.append(length[nearest])

@@ -69,7 +69,7 @@ def print_summary(imported: Imported, folder: Path) -> None:
     lead, reasons = imported.verdict.in_words()
     for line in (f"{folder}: {lead}", *(f"- {reason}" for reason in reasons)):
         console.print(line, soft_wrap=True, markup=False)
-    found = {finding.name: finding.said for finding in imported.findings}
+    found = {finding.name: finding.message for finding in imported.findings}
     table = Table(box=None, show_header=False, pad_edge=False)
     for name in _IN_TERMINAL:
         if name in found:
@@ -96,13 +96,13 @@ def _proposals(imported: Imported) -> Table:
     for proposal in imported.proposals:
         style = "bold" if imported.chosen and proposal is imported.chosen.proposal else ""
         names: tuple[str, ...] = (proposal.kind, _counts(proposal), f"{proposal.near:.0%}", _quality(proposal))
-        for unit, told in _told(proposal, imported.unit).items():
-            table.add_row(*names, unit, *map(_short, told), style=style)
+        for unit, quantiles in _distances(proposal, imported.unit).items():
+            table.add_row(*names, unit, *map(_short, quantiles), style=style)
             names = ("", "", "", "")
     return table
 
 
-def _told(proposal: SplitCandidate, unit: str) -> dict[str, tuple[float, float, float]]:
+def _distances(proposal: SplitCandidate, unit: str) -> dict[str, tuple[float, float, float]]:
     return {unit: proposal.length, "deg": proposal.turn_deg, "steps": proposal.steps}
 
 
@@ -116,7 +116,7 @@ def _quality(proposal: SplitCandidate) -> str:
 
 
 def _spans(proposal: SplitCandidate) -> list[str]:
-    return [f"{_short(b)} ({_short(a)} to {_short(c)})" for a, b, c in _told(proposal, "").values()]
+    return [f"{_short(b)} ({_short(a)} to {_short(c)})" for a, b, c in _distances(proposal, "").values()]
 
 
 def _short(number: float) -> str:
@@ -126,7 +126,7 @@ def _short(number: float) -> str:
 def _page(imported: Imported, name: str) -> str:
     capture = imported.capture
     parts = [f"# {name}", _verdict(imported), f"![Cameras from above and from the side]({PLOT_FILE})", "## Found"]
-    parts.append(_table(("check", "found"), [(finding.name, finding.said) for finding in imported.findings]))
+    parts.append(_table(("check", "found"), [(finding.name, finding.message) for finding in imported.findings]))
     if imported.agreement is not None and imported.agreement.is_known:
         parts += _of_agreement(imported.agreement, imported.unit)
     parts.append("## Split")
@@ -137,7 +137,7 @@ def _page(imported: Imported, name: str) -> str:
         parts.append(f"By **{chosen.proposal.kind}**: {chosen.proposal.how}; {chosen.why}.")
         parts += [f"**Warning:** {chosen.warning}."] if chosen.warning else []
         parts.append(f"{_TABLE_TITLE[0].upper()}{_TABLE_TITLE[1:]}: median (10 % to 90 %).")
-        header = ("split by", "train/val/test", "near", "", *_told(chosen.proposal, imported.unit))
+        header = ("split by", "train/val/test", "near", "", *_distances(chosen.proposal, imported.unit))
         rows = [
             (each.kind, _counts(each), f"{each.near:.0%}", _quality(each), *_spans(each)) for each in imported.proposals
         ]

@@ -14,7 +14,7 @@ from rich.progress import track
 
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.runtime.sources import SourceFrame, frames_of
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
 """Suffixes of files that are taken for videos."""
@@ -36,19 +36,19 @@ class VideoFrames(NamedTuple):
     read: int
 
 
-def chosen_as_stored(film: Path) -> VideoFrames:
+def chosen_as_stored(video: Path) -> VideoFrames:
     """Choose frames of a video, and write them with the pixels that the video stores, whatever rotation it asks for.
 
     Raises:
         InputError: where the video cannot be opened, or the cache not be written.
     """
-    folder = made_once(f"films/{digest_of([film], _VERSION)}", lambda partial: _write_chosen(film, partial))
+    folder = cached_folder(f"films/{digest_of([video], _VERSION)}", lambda partial: _write_chosen(video, partial))
     images = {int(path.stem): path for path in sorted(folder.glob("*.jpg"))}
     return VideoFrames(images, json.loads((folder / _NOTE).read_text(encoding="utf-8"))["count"])
 
 
-def _write_chosen(film: Path, folder: Path) -> None:
-    frames, count = frames_of(film, is_upright=False)
+def _write_chosen(video: Path, folder: Path) -> None:
+    frames, count = frames_of(video, is_upright=False)
     watched = Counted(track(frames, "Choosing frames", count, console=Console(stderr=True), transient=True))
     write_frames(choose_frames(watched), folder)
     (folder / _NOTE).write_text(json.dumps({"count": watched.count}), encoding="utf-8")

@@ -47,18 +47,18 @@ def _without(capture: Capture, rules: Mapping[int, str]) -> tuple[Capture, dict[
 
 
 def _in_metres(capture: Capture, metres_per_unit: float | None) -> Capture:
-    said = capture.choices.get("scale", "")
+    stated = capture.choices.get("scale", "")
     if metres_per_unit is not None:
-        told = f"multiplied by {metres_per_unit:g}, as --metres-per-unit says; otherwise: {said}"
+        scale = f"multiplied by {metres_per_unit:g}, as --metres-per-unit says; otherwise: {stated}"
     elif capture.metres_per_unit in (None, 1.0):
         return capture
     else:
         metres_per_unit = capture.metres_per_unit
-        told = f"multiplied by {metres_per_unit:g}: {said}"
+        scale = f"multiplied by {metres_per_unit:g}: {stated}"
     world_from_cam = capture.world_from_cam.copy()
     world_from_cam[:, :3, 3] *= metres_per_unit
     depth = capture.depth and replace(capture.depth, step=capture.depth.step * metres_per_unit)
-    choices = {**capture.choices, "scale": told}
+    choices = {**capture.choices, "scale": scale}
     tracks = capture.tracks and capture.tracks.moved(metres_per_unit, np.zeros(3))
     return replace(
         capture,
@@ -81,12 +81,12 @@ def _near_the_origin(capture: Capture) -> Capture:
         return replace(capture, choices={"origin": "as in the source", **capture.choices})
     world_from_cam = capture.world_from_cam.copy()
     world_from_cam[:, :3, 3] -= middle
-    told = f"shifted to {middle.tolist()} of the source's world, so that float32 holds the positions"
+    origin = f"shifted to {middle.tolist()} of the source's world, so that float32 holds the positions"
     tracks = capture.tracks and capture.tracks.moved(1.0, -middle)
     return replace(
         capture,
         world_from_cam=world_from_cam,
-        choices={**capture.choices, "origin": told},
+        choices={**capture.choices, "origin": origin},
         tracks=tracks,
         world=replace(capture.world, offset_m=tuple(middle.tolist())),
     )

@@ -79,9 +79,9 @@ def _direction_distance(cells: CellPrediction, target: PoseBatch, share: Tensor)
     return (share * torch.linalg.vector_norm(cells.rays_world - true, dim=-1)).sum() / 2
 
 
-def _point_distance(said_m: Tensor, grid: tuple[int, int], target: PoseBatch) -> Tensor:
+def _point_distance(predicted_m: Tensor, grid: tuple[int, int], target: PoseBatch) -> Tensor:
     true_m, is_seen = points_of_cells(target, grid)
-    distance_m = torch.linalg.vector_norm(said_m - true_m, dim=-1)
+    distance_m = torch.linalg.vector_norm(predicted_m - true_m, dim=-1)
     return torch.where(is_seen, distance_m, 0.0).sum() / is_seen.sum().clamp_min(1)
 
 

@@ -27,10 +27,10 @@ Floats = NDArray[np.floating[Any]]
 
 _STEPS = 12
 _CONVERGED = 1e-3  # of the cost
-_DAMPING, _MOST_DAMPING = 1e-4, 1e4
+_DAMPING, _MAX_DAMPING = 1e-4, 1e4
 _FOCAL, _RADIAL = 0.02, 0.05  # one standard deviation of the prior
 _FIXED = 1e-9
-_LEAST_DEPTH = 1e-3  # of the cameras' spread
+_MIN_DEPTH = 1e-3  # of the cameras' spread
 _DEPTH = 0.02  # of a measured depth, one standard deviation
 
 
@@ -86,7 +86,7 @@ def adjust(
     for _ in range(_STEPS):
         equations = problem.linearized(now)
         new_cost = np.inf
-        while new_cost >= cost and damping < _MOST_DAMPING:
+        while new_cost >= cost and damping < _MAX_DAMPING:
             new = now.moved(*equations.solve(damping))
             new_cost, damping = problem.cost(new), damping * 10
         if new_cost >= cost:
@@ -121,7 +121,7 @@ class _Problem:
         self.is_fixed = np.zeros(len(seen), bool)
         self.is_measured = np.isfinite(depth_m)
         self.depth_m = np.where(self.is_measured, depth_m, np.inf)[:, None]  # infinite, so that it weighs nothing
-        self.least_depth = _LEAST_DEPTH * spread_m(given)
+        self.min_depth = _MIN_DEPTH * spread_m(given)
         self.of_lens = np.zeros(len(seen), np.int64) if camera is None else camera[seen.frame]
         pose, lens = np.repeat(drift, 3), np.array((_FOCAL, _RADIAL)) * (_FIXED if camera is None else 1)
         self.prior = np.concatenate((np.tile(pose, len(given)), np.tile(lens, len(start.lenses)))) ** -2.0
@@ -143,7 +143,7 @@ class _Problem:
         """
         towards = at.points_m[self.seen.track] - at.world_from_cam[self.seen.frame, :3, 3]
         cam = np.einsum("oji,oj->oi", at.world_from_cam[self.seen.frame, :3, :3], towards)
-        depth = np.maximum(cam[:, 2:], self.least_depth)
+        depth = np.maximum(cam[:, 2:], self.min_depth)
         ideal = cam[:, :2] / depth
         claimed = np.empty_like(ideal)
         for number, lens in enumerate(at.lenses):

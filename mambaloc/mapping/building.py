@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
-_LEAST_KEYPOINTS = 20
-_LEAST_AGREEING = 0.3  # of matches; a tenth agree with any pose by chance
+_MIN_KEYPOINTS = 20
+_MIN_AGREEING = 0.3  # of matches; a tenth agree with any pose by chance
 
 POINTS = ("triangulated", COLMAP := "colmap")
 """Values of :attr:`MapSettings.points`."""
@@ -136,10 +136,10 @@ def build_map(frames: PosedFrames, settings: MapSettings, scene: str, threads: i
             features, key.world_from_cam, pairs, matches, np.random.default_rng(settings.seed)
         )
     _check_enough(scene, structure, settings.least_inliers)
-    most = settings.most_bytes // bytes_each(len(key))
+    max_points = settings.most_bytes // bytes_each(len(key))
     camera = features[0]
     drift, nugget = fit_drift(structure.world_from_cam, key.world_from_cam)
-    kept = most_useful(structure.seen, len(structure.points_m), most, camera.size[0] / camera.intrinsics[0, 0])
+    kept = most_useful(structure.seen, len(structure.points_m), max_points, camera.size[0] / camera.intrinsics[0, 0])
     return SparseMap(
         structure.points_m[kept].astype(np.float32),
         quantized(structure.descriptors[kept]),
@@ -197,7 +197,7 @@ def _searched(
 
     with ThreadPoolExecutor(threads) as pool:
         features = _each(pool, searched, range(len(key)), "keypoints")
-        if (keypoints := np.median([len(each) for each in features])) < _LEAST_KEYPOINTS:
+        if (keypoints := np.median([len(each) for each in features])) < _MIN_KEYPOINTS:
             raise InputError(
                 f"{scene}: its frames have {keypoints:.0f} keypoints each. "
                 "Film surfaces with more texture, or give larger images and a larger width."
@@ -210,11 +210,11 @@ def _each(pool: ThreadPoolExecutor, work: Callable[[S], T], items: Sequence[S], 
     return list(progress(pool.map(work, items), name, len(items)))
 
 
-def _check_enough(scene: str, structure: Structure, least: int) -> None:
-    if structure.agreeing < _LEAST_AGREEING:
+def _check_enough(scene: str, structure: Structure, min_points: int) -> None:
+    if structure.agreeing < _MIN_AGREEING:
         raise InputError(
             f"{scene}: {100 * structure.agreeing:.0f} % of the matches between its frames agree with their poses. "
             "Check that poses and intrinsics belong to the images."
         )
-    if (points := len(structure.points_m)) < least:
+    if (points := len(structure.points_m)) < min_points:
         raise InputError(f"{scene}: its frames give {points} points. Give more frames, taken from further apart.")

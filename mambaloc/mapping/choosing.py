@@ -14,7 +14,7 @@ Indices = NDArray[np.int64]
 _CELLS = 8  # across an image's width
 
 
-def most_useful(seen: Observations, points: int, most: int, width: float) -> Indices:
+def most_useful(seen: Observations, points: int, max_points: int, width: float) -> Indices:
     """Choose points greedily, so that each part of each key frame's image keeps some.
 
     Images are divided into square cells, eight across. A point is worth the sum over the cells that it is seen in of
@@ -31,14 +31,18 @@ def most_useful(seen: Observations, points: int, most: int, width: float) -> Ind
     Args:
         seen: where key frames see which point.
         points: how many there are.
-        most: how many to keep.
+        max_points: how many to keep.
         width: of the images, in the plane at depth 1.
 
     Returns:
         Rows of points, those that most key frames see first; in no order where as many see them.
     """
     views = np.unique(np.stack((seen.track, seen.frame)), axis=1)[0]
-    chosen = np.arange(points) if points <= most else _cover(seen.track, _cells(seen, width / _CELLS), points, most)
+    chosen = (
+        np.arange(points)
+        if points <= max_points
+        else _cover(seen.track, _cells(seen, width / _CELLS), points, max_points)
+    )
     # In the order of frames, the first of many that two frames see would all be of one place.
     chosen = np.random.default_rng(0).permutation(chosen)
     return chosen[np.argsort(-np.bincount(views, minlength=points)[chosen], kind="stable")]
@@ -55,7 +59,7 @@ def _cells(seen: Observations, side: float) -> Indices:
     return np.unique(places, axis=0, return_inverse=True)[1].ravel()
 
 
-def _cover(point: Indices, cell: Indices, points: int, most: int) -> Indices:
+def _cover(point: Indices, cell: Indices, points: int, max_points: int) -> Indices:
     """The first of the greedy order, ascending.
 
     Worth only falls, so a point that is still worth most once its worth is up to date is the best (Minoux 1978).
@@ -65,7 +69,7 @@ def _cover(point: Indices, cell: Indices, points: int, most: int) -> Indices:
     queue = [(-float(len(each)), row) for row, each in enumerate(cells)]
     heapq.heapify(queue)
     chosen: list[int] = []
-    while len(chosen) < most:
+    while len(chosen) < max_points:
         before, row = queue[0]
         worth = -float(share[cells[row]].sum())
         if worth > before:

@@ -16,10 +16,10 @@ Floats = NDArray[np.floating[Any]]
 _LIKE_DEG, _LIKE_OCTAVES = 18.0, 0.7  # a point looks like itself from so far around, and from 2^0.7 times as near
 _SHARE = 0.25  # of the points that look alike, which are matched
 _OFF_PX = 0.5
-_LEAST_CHANCE = 0.02
+_MIN_PROBABILITY = 0.02
 _OCTAVES = 3.0  # of matches, or of the deviation, from lost to sure
 _UNSURE = 2.0  # times the matches that a pose needs: half of the frames that expect so many are found
-_MOST_DEVIATION = 0.03  # of the key frames' spread
+_MAX_DEVIATION = 0.03  # of the key frames' spread
 
 
 class Outlook:
@@ -56,7 +56,7 @@ class Outlook:
         depth_m = np.maximum(np.linalg.norm(towards, axis=1), 1e-9)
         towards /= depth_m[:, None]
         chance = self._chance(towards, depth_m)
-        near = np.flatnonzero(chance > _LEAST_CHANCE)
+        near = np.flatnonzero(chance > _MIN_PROBABILITY)
         counts = _SHARE * chance[near] * self._is_inside(towards[near], rotations)
         normal = (counts @ _information(towards[near], depth_m[near])).reshape(-1, 6, 6)
         return counts.sum(axis=1), _deviation_m(normal) * _OFF_PX / float(self.map.intrinsics[0, 0])
@@ -64,7 +64,7 @@ class Outlook:
     def certainty(self, matches: Floats, deviation_m: Floats) -> Floats:
         """What :meth:`of` returns as one number from 0, lost, to 1, sure; at 0.5 every second camera is found."""
         enough = np.log2(np.maximum(matches, 1e-9) / (_UNSURE * self.map.least_inliers))
-        allowed = _MOST_DEVIATION * spread_m(self.map.key_poses)
+        allowed = _MAX_DEVIATION * spread_m(self.map.key_poses)
         precise = np.log2(allowed / np.clip(deviation_m, 1e-12, 1e12))
         return np.clip(0.5 + np.minimum(enough, precise) / _OCTAVES, 0, 1)
 
@@ -97,5 +97,5 @@ def _deviation_m(normal: Floats) -> Floats:
     """Of positions, in the direction that is least sure, from normal equations (N, 6, 6)."""
     place, both, turn = normal[:, :3, :3], normal[:, :3, 3:], normal[:, 3:, 3:]
     left = place - both @ np.linalg.pinv(turn, hermitian=True) @ both.transpose(0, 2, 1)
-    least = np.linalg.eigvalsh(left)[:, 0]
-    return np.where(least > 1e-9, 1 / np.sqrt(np.maximum(least, 1e-9)), np.inf)
+    min_eigenvalue = np.linalg.eigvalsh(left)[:, 0]
+    return np.where(min_eigenvalue > 1e-9, 1 / np.sqrt(np.maximum(min_eigenvalue, 1e-9)), np.inf)

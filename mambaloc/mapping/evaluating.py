@@ -19,7 +19,7 @@ from scipy.special import chdtri
 
 from mambaloc import provenance
 from mambaloc.console import progress
-from mambaloc.files import sha256, whole_file, writing
+from mambaloc.files import atomic_file, sha256, writing
 from mambaloc.images import Image, read_image
 from mambaloc.mapping.building import PosedFrames, build_map, describe_points
 from mambaloc.mapping.posed import read_frames
@@ -236,7 +236,7 @@ def measure_saved(path: Path, recipe: MapRecipe, test: PosedFrames, making: Maki
     result = _result(path, sparse_map, errors, recipe, making, time.perf_counter() - started)
     # JSON has no infinity, which the worst error is where a frame has no pose.
     finite = {name: value if math.isfinite(value) else None for name, value in result["metrics"].items()}
-    with writing(path.parent), whole_file(path.parent / "metrics.json") as partial:
+    with writing(path.parent), atomic_file(path.parent / "metrics.json") as partial:
         partial.write_text(json.dumps({**result, "metrics": finite}, indent=2) + "\n", encoding="utf-8")
     return MeasuredMap(sparse_map, test, errors, result)
 

@@ -26,7 +26,7 @@ Indices = NDArray[np.int64]
 # round: frames that were found one after another drift at first.
 _NEAR_PX = (12.0, 4.0, 2.0)
 _SIGMA = 0.125  # of that
-_LEAST_AGREEING = 0.3  # of the matches of a pair
+_MIN_AGREEING = 0.3  # of the matches of a pair
 _FREE = 3.0  # of the key frames' spread, and radians; how far poses that only the map gives may move
 
 
@@ -52,7 +52,7 @@ def extend(
     matched: Callable[[int, int], Indices],
     world_from_cam: Floats,
     given: Floats | None,
-    most_points: int,
+    max_points: int,
 ) -> Extension:
     """Adjust the poses of new key frames to the map's points, which stay, and to points that they see together.
 
@@ -62,7 +62,7 @@ def extend(
         matched: rows of keypoints that match between two frames, (M, 2).
         world_from_cam: where the map found it, (N, 4, 4).
         given: the same from elsewhere, a prior; None where that is not known.
-        most_points: new points to keep.
+        max_points: new points to keep.
     """
     sparse_map, rng, poses = localizer.map, np.random.default_rng(0), world_from_cam
     unit_m = spread_m(sparse_map.key_poses)
@@ -80,7 +80,7 @@ def extend(
             prior = poses if given is None else given
             poses = adjust(start, prior, drift, both, sigma, is_fixed=is_fixed).world_from_cam
     descriptors = mean_descriptors(features, len(points_m), seen, keypoint)
-    kept = most_useful(seen, len(points_m), most_points, sparse_map.size[0] / focal_px)
+    kept = most_useful(seen, len(points_m), max_points, sparse_map.size[0] / focal_px)
     old, new = (views_of(each, count, len(poses)) for each, count in ((known, len(sparse_map)), (seen, len(points_m))))
     return Extension(poses, old, points_m[kept], descriptors[kept], new[kept])
 
@@ -112,7 +112,7 @@ def _pairs(
     for first, second in pairs_by_pose(world_from_cam).tolist():
         rows = matched(first, second)
         agree = agreeing(features, cam_from_world, np.array((first, second)), rows, near_px)
-        if len(agree) > _LEAST_AGREEING * len(rows):
+        if len(agree) > _MIN_AGREEING * len(rows):
             pairs.append((first, second))
             matches.append(agree[~is_known[first][agree[:, 0]] & ~is_known[second][agree[:, 1]]])
     return np.array(pairs, np.int64).reshape(-1, 2), matches

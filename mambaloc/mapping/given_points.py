@@ -33,16 +33,16 @@ def described(tracks: Tracks, features: Sequence[Features], world_from_cam: Floa
     near = _NEAR_PX * features[0].size[0] / 160 / features[0].intrinsics[0, 0]
     first = np.cumsum([0, *(len(each) for each in features)])
     keypoint = np.full(len(tracks.frame), -1)
-    apart = np.full(len(tracks.frame), np.inf)
+    distance = np.full(len(tracks.frame), np.inf)
     for frame, each in enumerate(features):
         rows = np.flatnonzero(tracks.frame == frame)
         if len(each) and len(rows):
-            apart[rows], nearest = cKDTree(each.rays).query(tracks.rays[rows])
+            distance[rows], nearest = cKDTree(each.rays).query(tracks.rays[rows])
             keypoint[rows] = first[frame] + nearest
-    order = np.argsort(apart, kind="stable")
+    order = np.argsort(distance, kind="stable")
     used = np.zeros(len(order), bool)
     used[order[np.unique(keypoint[order], return_index=True)[1]]] = True  # a keypoint shows one point, the nearest
-    used = np.flatnonzero(used & (apart <= near))
+    used = np.flatnonzero(used & (distance <= near))
     used = used[np.argsort(tracks.point[used], kind="stable")]
     rows, track = np.unique(tracks.point[used], return_inverse=True)
     seen = Observations(tracks.frame[used], track, tracks.rays[used], np.full(len(used), near))

@@ -23,7 +23,7 @@ from mambaloc.runtime.maps.viewpoints import spread_m
 
 Floats = NDArray[np.floating[Any]]
 
-_MOST_NAMED = 8
+_MAX_NAMED = 8
 # Times the inliers that an answer needs: a wrong pose that is built on misleads later ones, and a frame that has few of
 # them has more once its neighbours were added.
 _INLIERS = 3
@@ -68,8 +68,8 @@ class Growth:
             f"in {self.rounds} rounds; {len(self.sparse_map)} points in all"
         )
         if self.lost:
-            more = f" and {len(self.lost) - _MOST_NAMED} more" if len(self.lost) > _MOST_NAMED else ""
-            text += f"\nnot found in the map: {len(self.lost)} frames, {', '.join(self.lost[:_MOST_NAMED])}{more}"
+            more = f" and {len(self.lost) - _MAX_NAMED} more" if len(self.lost) > _MAX_NAMED else ""
+            text += f"\nnot found in the map: {len(self.lost)} frames, {', '.join(self.lost[:_MAX_NAMED])}{more}"
         return text
 
 
@@ -167,12 +167,12 @@ def _grown(
     matched: Callable[[int, int], NDArray[np.int64]],
     poses: dict[int, CameraPose],
     session: str,
-    most: int,
+    max_key_frames: int,
     most_bytes: int,
 ) -> tuple[SparseMap, list[int]]:
     """The map with frames whose poses are known, and which became key frames; their poses are adjusted in place."""
     rows = np.array(sorted(poses))
-    key = rows[farthest_first(np.stack([poses[row].matrix for row in rows]), most)].tolist()
+    key = rows[farthest_first(np.stack([poses[row].matrix for row in rows]), max_key_frames)].tolist()
     localizer = MapLocalizer(sparse_map)
     given = [pose for row in key if (pose := frames[row].given) is not None]
     is_given = len(given) == len(key)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mambaloc.images import Image, as_rgb, read_image
 from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps.features import Features, Keypoints, find_keypoints
-from mambaloc.user_cache import arrays_made_once, fingerprint
+from mambaloc.user_cache import cached_arrays, fingerprint
 
 Indices = NDArray[np.int64]
 
@@ -66,7 +66,7 @@ def kept_matches(features: Sequence[Features], names: Sequence[str | None]) -> l
 
 
 def _kept(name: str | None, make: Callable[[], dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    return arrays_made_once(name, make) if name else make()
+    return cached_arrays(name, make) if name else make()
 
 
 def _digest(*parts: bytes) -> str:

@@ -20,7 +20,7 @@ from mambaloc.mapping.recipe import recipe_of
 from mambaloc.runtime.maps import CameraPose, MapLocalizer
 from mambaloc.runtime.sources import frames_of
 
-_MOST_FRAMES = 400  # of a video; two a second of three minutes
+_MAX_FRAMES = 400  # of a video; two a second of three minutes
 _FOCAL_SCALES = (0.7, 0.84, 1.0, 1.2, 1.44)
 _FOCAL_FRAMES = 8
 _CLEARLY_MORE = 1.3
@@ -75,7 +75,7 @@ def _unposed(
     if count is None:  # some videos do not say; they are decoded twice
         count = sum(1 for _ in frames)
         frames = frames_of(source)[0]
-    step = max(1, -(-count // _MOST_FRAMES))
+    step = max(1, -(-count // _MAX_FRAMES))
     chosen = itertools.islice(frames, 0, None, step)
     for frame in progress(chosen, "keypoints", -(-count // step)):
         image, matrix = frame.image, intrinsics

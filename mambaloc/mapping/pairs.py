@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.runtime.maps.viewpoints import spread_m
 
-_LEAST_MOVE, _MOST_MOVE = 0.05, 2.5  # of the cameras' spread: 3 cm to 1.5 m in a room that is filmed from its middle
-_MOST_TURN_DEG = 40.0
+_MIN_MOVE, _MAX_MOVE = 0.05, 2.5  # of the cameras' spread: 3 cm to 1.5 m in a room that is filmed from its middle
+_MAX_TURN_DEG = 40.0
 _NEAREST, _SPREAD = 8, 8
 
 
@@ -29,7 +29,7 @@ def pairs_by_pose(world_from_cam: ArrayLike) -> NDArray[np.int64]:
     for row in range(len(poses)):
         move = np.linalg.norm(poses[:, :3, 3] - poses[row, :3, 3], axis=1) / unit
         cosine = poses[:, :3, 2] @ poses[row, :3, 2]
-        fits = (move >= _LEAST_MOVE) & (move <= _MOST_MOVE) & (cosine >= np.cos(np.radians(_MOST_TURN_DEG)))
+        fits = (move >= _MIN_MOVE) & (move <= _MAX_MOVE) & (cosine >= np.cos(np.radians(_MAX_TURN_DEG)))
         order = np.flatnonzero(fits)[np.argsort(move[fits], kind="stable")]
         rest = order[_NEAREST:]
         spread = np.unique(np.linspace(0, len(rest) - 1, min(_SPREAD, len(rest))).round().astype(int))

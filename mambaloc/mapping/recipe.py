@@ -37,7 +37,7 @@ class MapRecipe:
 
 
 _TYPES = {"scene": str, "dataset": str, "root": str, "label": str}
-LEAST = {"key_frames": 2, "width": 32, "most_bytes": 1000, "least_inliers": 4, "seed": 0}
+MINIMUM = {"key_frames": 2, "width": 32, "most_bytes": 1000, "least_inliers": 4, "seed": 0}
 """Smallest allowed value of each setting."""
 
 
@@ -53,19 +53,19 @@ def read_recipe(path: Path) -> MapRecipe:
     for key, value in data.items():
         if key in _TYPES:
             fits, what = isinstance(value, str), "text"
-        elif key in LEAST:
-            fits, what = _is_int(value, LEAST[key]), f"a whole number of {LEAST[key]} or more"
+        elif key in MINIMUM:
+            fits, what = _is_int(value, MINIMUM[key]), f"a whole number of {MINIMUM[key]} or more"
         elif key == "points":
             fits, what = value in POINTS, " or ".join(POINTS)
         elif key == "ransac_seeds":
             fits = isinstance(value, list) and len(value) > 0 and all(_is_int(seed, 0) for seed in value)
             what = "a list of whole numbers"
         else:
-            known = ", ".join((*_TYPES, *LEAST, "points", "ransac_seeds"))
+            known = ", ".join((*_TYPES, *MINIMUM, "points", "ransac_seeds"))
             raise InputError(f"{path}: {key!r} is unknown. Choose among {known}.")
         if not fits:
             raise InputError(f"{path}: {key} is {str(value)[:40]!r}. Give {what}.")
-    settings = MapSettings(**{key: value for key, value in data.items() if key in (*LEAST, "points")})
+    settings = MapSettings(**{key: value for key, value in data.items() if key in (*MINIMUM, "points")})
     texts = {key: value for key, value in data.items() if key in _TYPES}
     return MapRecipe(**texts, settings=settings, ransac_seeds=tuple(data.get("ransac_seeds", (0, 1, 2))))
 
@@ -75,5 +75,5 @@ def recipe_of(source: Path) -> MapRecipe:
     return MapRecipe(str(source)) if source.is_dir() else read_recipe(source)
 
 
-def _is_int(value: object, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+def _is_int(value: object, minimum: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= minimum

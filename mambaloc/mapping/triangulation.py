@@ -18,8 +18,8 @@ Indices = NDArray[np.int64]
 _DRAWS = 16  # pairs of views tried a track
 _STEPS = 5
 _DAMPING = 1e-6  # of the normal equations' trace
-_LEAST_ANGLE_DEG = 1.5
-_LEAST_SHARE = 0.25
+_MIN_ANGLE_DEG = 1.5
+_MIN_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Observations:
         """The same, nearer where most are: five times the median of what agrees, as far as that is less."""
         agrees = off <= self.near
         share = 5 * float(np.median(off[agrees] / self.near[agrees])) if agrees.any() else 1.0
-        return Observations(self.frame, self.track, self.rays, self.near * min(1.0, max(share, _LEAST_SHARE)))
+        return Observations(self.frame, self.track, self.rays, self.near * min(1.0, max(share, _MIN_SHARE)))
 
     def renumbered(self) -> Observations:
         """The same with tracks numbered from 0 without gaps."""
@@ -78,7 +78,7 @@ def triangulate(
         seen = seen.as_near_as(residuals(cam_from_world, seen, points))
     agrees = residuals(cam_from_world, seen, points) <= seen.near
     frames = _count(seen.track[agrees], len(points), seen.frame[agrees])
-    is_point = (frames >= 2) & (_widest_angle_deg(cam_from_world, seen, points, agrees) >= _LEAST_ANGLE_DEG)
+    is_point = (frames >= 2) & (_widest_angle_deg(cam_from_world, seen, points, agrees) >= _MIN_ANGLE_DEG)
     return points, is_point, agrees
 
 
@@ -96,15 +96,15 @@ def _best_of_pairs(cam_from_world: Floats, seen: Observations, rng: np.random.Ge
     center, ray = _world_rays(cam_from_world, seen)
     start = np.flatnonzero(np.diff(seen.track, prepend=-1))
     length = np.diff(start, append=len(seen))
-    best, least = np.zeros((len(start), 3)), np.full(len(start), np.inf)
+    best, lowest_cost = np.zeros((len(start), 3)), np.full(len(start), np.inf)
     for _ in range(_DRAWS):
         one = rng.integers(length)
         other = (one + 1 + rng.integers(length - 1)) % length
         points = _between(center[start + one], ray[start + one], center[start + other], ray[start + other])
         off = np.minimum(residuals(cam_from_world, seen, points) / seen.near, 1) ** 2
         cost = np.add.reduceat(off, start)
-        is_better = cost < least
-        best[is_better], least[is_better] = points[is_better], cost[is_better]
+        is_better = cost < lowest_cost
+        best[is_better], lowest_cost[is_better] = points[is_better], cost[is_better]
     return best
 
 
@@ -117,8 +117,8 @@ def _world_rays(cam_from_world: Floats, seen: Observations) -> tuple[Floats, Flo
 
 def _between(start_a: Floats, ray_a: Floats, start_b: Floats, ray_b: Floats) -> Floats:
     """The middle of the shortest line between two rays, (T, 3); anywhere where they are parallel."""
-    apart, cosine = start_b - start_a, (ray_a * ray_b).sum(axis=1)
-    along_a, along_b = (apart * ray_a).sum(axis=1), (apart * ray_b).sum(axis=1)
+    baseline, cosine = start_b - start_a, (ray_a * ray_b).sum(axis=1)
+    along_a, along_b = (baseline * ray_a).sum(axis=1), (baseline * ray_b).sum(axis=1)
     scale = 1 / np.maximum(1 - cosine**2, 1e-12)
     on_a = start_a + ((along_a - cosine * along_b) * scale)[:, None] * ray_a
     on_b = start_b + ((cosine * along_a - along_b) * scale)[:, None] * ray_b
@@ -162,11 +162,11 @@ def _widest_angle_deg(cam_from_world: Floats, seen: Observations, points: Floats
     towards = center - points[used.track]
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     tracks, start = np.unique(used.track, return_index=True)
-    pivot, least = np.zeros((len(points), 3)), np.ones(len(points))
+    pivot, min_cosine = np.zeros((len(points), 3)), np.ones(len(points))
     pivot[tracks] = towards[start]
     for _ in range(2):
         cosine = (towards * pivot[used.track]).sum(axis=1)
         order = np.lexsort((cosine, used.track))
         first = order[np.searchsorted(used.track[order], tracks)]
-        least[tracks], pivot[tracks] = cosine[first], towards[first]
-    return np.degrees(np.arccos(np.clip(least, -1, 1)))
+        min_cosine[tracks], pivot[tracks] = cosine[first], towards[first]
+    return np.degrees(np.arccos(np.clip(min_cosine, -1, 1)))

@@ -216,10 +216,10 @@ class LitPoseRegressor(L.LightningModule):
 
     def on_train_start(self) -> None:
         """Open the cache of frozen features, now that the training images, views among them, are known."""
-        if most_gib := self.hparams["feature_cache_gib"]:
+        if max_gib := self.hparams["feature_cache_gib"]:
             split = SplitBackbone(self.network.backbone, self.image_size)
             data = self.scene_for("feature_cache_gib")
-            self._split = split, FeatureCache.of_training(data, split, self.device, int(most_gib * 2**30))
+            self._split = split, FeatureCache.of_training(data, split, self.device, int(max_gib * 2**30))
 
     def teardown(self, stage: str) -> None:
         """Let go of what only training needs: checkpoints and copies know nothing of it."""

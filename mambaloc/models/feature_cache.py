@@ -18,7 +18,7 @@ from mambaloc.files import claim_space
 from mambaloc.memory import release_pages
 from mambaloc.nn import SplitBackbone
 from mambaloc.types import PoseBatch
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 _REMEDY = "make room, set MAMBALOC_CACHE elsewhere, or set model.feature_cache_gib to 0"
 
@@ -34,7 +34,7 @@ class FeatureCache:
         sample: one image, (1, 3, H, W), whose features have the shapes to expect.
         rows: how many training images there are.
         draws: how many augmentations each has.
-        most_bytes: of the file.
+        max_bytes: of the file.
         key: names whatever else the features depend on.
         cache_dir: where it is kept; the user's cache folder unless given.
 
@@ -48,34 +48,34 @@ class FeatureCache:
         sample: Tensor,
         rows: int,
         draws: int,
-        most_bytes: int,
+        max_bytes: int,
         key: str,
         cache_dir: Path | None = None,
     ) -> None:
         self.compute, self.rows, self.draws = compute, rows, draws
         self.shapes = [tuple(each.shape[1:]) for each in compute(sample)]
         self._sizes = [math.prod(shape) for shape in self.shapes]
-        room = min(rows * draws, most_bytes // (2 * sum(self._sizes)))
+        room = min(rows * draws, max_bytes // (2 * sum(self._sizes)))
         name = hashlib.sha256(f"{key} {self.shapes} {rows} {room}".encode()).hexdigest()[:32]
 
         def make(empty: Path) -> None:
             _make_file(empty / "features.npy", np.float16, (room, sum(self._sizes)))
             _make_file(empty / "is_kept.npy", np.bool_, (room,))
 
-        folder = made_once(f"features/{name}", make, cache_dir, _REMEDY)
+        folder = cached_folder(f"features/{name}", make, cache_dir, _REMEDY)
         self.features, self.is_kept = (
             np.load(folder / f"{file}.npy", mmap_mode="r+") for file in ("features", "is_kept")
         )
 
     @classmethod
-    def of_training(cls, data: Any, split: SplitBackbone, device: torch.device, most_bytes: int) -> FeatureCache:
+    def of_training(cls, data: Any, split: SplitBackbone, device: torch.device, max_bytes: int) -> FeatureCache:
         """Open the cache of a training.
 
         Args:
             data: the data module, whose training batches were asked for.
             split: whose frozen part is kept.
             device: where it computes.
-            most_bytes: of the file.
+            max_bytes: of the file.
 
         Raises:
             InputError: where images are augmented in a new way each epoch.
@@ -93,7 +93,7 @@ class FeatureCache:
         sample = torch.zeros(1, 3, *data.crop, device=device)
         rows = len(data.scene.items("train").position_m)
         return cls(
-            split.frozen, sample, rows, draws, most_bytes, digest.hexdigest(), Path(cache_dir) if cache_dir else None
+            split.frozen, sample, rows, draws, max_bytes, digest.hexdigest(), Path(cache_dir) if cache_dir else None
         )
 
     def __call__(self, batch: PoseBatch, epoch: int) -> list[Tensor]:

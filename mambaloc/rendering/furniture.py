@@ -55,8 +55,8 @@ def wardrobe(paint: Paint) -> Piece:
     for k in range(doors):
         for middle in (0.25, 0.6):
             w, h = paint.rng.uniform((0.16, 0.2), (0.8 * width / doors, 0.55))
-            picture = poster(paint, w, h, any_genre(paint))
-            _paste(front, picture, ((k + 0.46) / doors, middle + paint.rng.uniform(-0.05, 0.05)))
+            painting = poster(paint, w, h, any_genre(paint))
+            _paste(front, painting, ((k + 0.46) / doors, middle + paint.rng.uniform(-0.05, 0.05)))
     body = box((0, -depth, 0), (width, 0, height), partial(wood, paint, color=timber), front=front)
     return Piece(width, depth, height, body + _clutter(paint, 0, width, -depth / 2, height, 2))
 
@@ -238,12 +238,12 @@ def _fronts(paint: Paint, image: Image, rows: int, columns: int) -> Image:
     return image
 
 
-def _paste(surface: Image, picture: Image, center: ArrayLike) -> None:
+def _paste(surface: Image, painting: Image, center: ArrayLike) -> None:
     """Stick an image that fits onto a surface, ``centre`` as fractions of its width and height."""
-    (h, w), (rows, columns) = surface.shape[:2], picture.shape[:2]
+    (h, w), (rows, columns) = surface.shape[:2], painting.shape[:2]
     x, y = np.round(np.asarray(center) * (w, h) - np.array([columns, rows]) / 2).astype(int)
     target = surface[max(0, y) : y + rows, max(0, x) : x + columns]
-    target[:] = picture[: target.shape[0], : target.shape[1]]
+    target[:] = painting[: target.shape[0], : target.shape[1]]
 
 
 def _shelves_of_books(paint: Paint, width_m: float, height_m: float, timber: Color) -> Image:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mambaloc.rendering.quads import Image, Quad, Vectors
 
 _CELL_M = 0.16  # one light probe per so many metres of surface
-_MOST_CELLS = 48
+_MAX_CELLS = 48
 _LIFT_M = 0.006  # probes stand off their surface, or it would shade itself
 
 
@@ -38,7 +38,7 @@ def lit(quads: Sequence[Quad], ambient: float = 0.55, gain: float = 5.5) -> list
 def _probes(quad: Quad) -> tuple[Vectors, Vectors, tuple[int, int]]:
     """Points (P, 3) on a grid over the quad, just in front of it, their normals (P, 3), and the grid's shape."""
     sizes_m = np.linalg.norm(quad.u_m), np.linalg.norm(quad.v_m)
-    columns, rows = (int(np.clip(np.ceil(size / _CELL_M), 2, _MOST_CELLS)) for size in sizes_m)
+    columns, rows = (int(np.clip(np.ceil(size / _CELL_M), 2, _MAX_CELLS)) for size in sizes_m)
     s, t = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     normal = np.cross(quad.v_m, quad.u_m)
     normal = normal / np.linalg.norm(normal)

@@ -28,7 +28,7 @@ from mambaloc.rendering.textures import (
 
 MARGIN_M = 1.2  # from the camera's box to the walls: deeper than any piece of furniture
 BELOW_M, ABOVE_M = 1.05, 0.9  # from the camera's box to the floor, which low tables fit under, and to the ceiling
-LEAST_HEIGHT_M = 2.5
+MIN_HEIGHT_M = 2.5
 _WIDEST_BOX_M = 3.5  # a larger camera box gets the room of a smaller one, scaled up
 
 
@@ -42,7 +42,7 @@ def furnished_room(inside_m: ArrayLike, seed: int, px_per_m: float = 280) -> Roo
     """
     lower, upper = np.asarray(inside_m, dtype=float)
     length, width, height = upper - lower + (2 * MARGIN_M, 2 * MARGIN_M, BELOW_M + ABOVE_M)
-    height = max(height, LEAST_HEIGHT_M)
+    height = max(height, MIN_HEIGHT_M)
     paint = Paint(np.random.default_rng(seed), px_per_m)
 
     quads = [*_ceiling(paint, length, width, height), _floor(paint, length, width)]
@@ -123,26 +123,26 @@ def _wall(paint: Paint, surface: Image, run: float, height: float, deck: _Deck, 
         w, h = paint.rng.uniform(0.28, 0.85, 2)
         left, bottom = paint.rng.uniform((0.05, 0.5), (max(0.06, run - w - 0.05), max(0.51, height - h - 0.06)))
         spot = (left, bottom, left + w, bottom + h)
-        if bottom + h < height and all(_apart(spot, other, 0.06) for other in taken):
+        if bottom + h < height and all(_has_gap(spot, other, 0.06) for other in taken):
             taken.append(spot)
-            picture = poster(paint, w, h, deck.posters)
+            painting = poster(paint, w, h, deck.posters)
             deck.posters += 1
-            _hang(surface, picture, paint.px(left), rows - paint.px(bottom + h))
+            _hang(surface, painting, paint.px(left), rows - paint.px(bottom + h))
     return [quad((0, 0, height), (run, 0, 0), (0, 0, -height), surface), *quads]
 
 
-def _apart(a: tuple[float, ...], b: tuple[float, ...], gap: float) -> bool:
+def _has_gap(a: tuple[float, ...], b: tuple[float, ...], gap: float) -> bool:
     return a[2] + gap < b[0] or b[2] + gap < a[0] or a[3] + gap < b[1] or b[3] + gap < a[1]
 
 
-def _hang(surface: Image, picture: Image, x: int, y: int) -> None:
+def _hang(surface: Image, painting: Image, x: int, y: int) -> None:
     """Put an image on a wall, over a soft shadow of itself."""
-    height, width = picture.shape[:2]
+    height, width = painting.shape[:2]
     edge = max(2, width // 24)
     below = surface[y : y + height + edge, x : x + width + edge]
     below[:] = (below * 0.6).astype(np.uint8)
     target = surface[y : y + height, x : x + width]
-    target[:] = picture[: target.shape[0], : target.shape[1]]
+    target[:] = painting[: target.shape[0], : target.shape[1]]
 
 
 def _ceiling(paint: Paint, length: float, width: float, height: float) -> list[Quad]:

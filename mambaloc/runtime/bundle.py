@@ -102,7 +102,7 @@ def replay(model: Path, frames: list[dict[str, Any]], threads: int | None = None
     """Let a model localize its bundle's frames: largest deviation in mm and degrees, and median latency in ms."""
     localizer = Localizer(model, threads)
     found = [(localizer.localize(model.parent / frame["file"], frame.get("intrinsics")), frame) for frame in frames]
-    in_scene = [  # frames are told in their scene's frame, as the models say them
+    in_scene = [  # frames are given in their scene's frame, as the models output them
         (replace(pose, position_m=pose.position_m - localizer.world_of(pose).offset_m), frame) for pose, frame in found
     ]
     return _compared(in_scene)

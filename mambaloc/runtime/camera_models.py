@@ -101,8 +101,8 @@ class OpenCVModel(CameraModel):
 
     def of_pixels(self, pinhole: Pinhole) -> NDArray[np.float32]:
         """Pixels of a pinhole's pixels, (H, W, 2) float32."""
-        matrix, told = matrix_of(self.focal_px, self.center_px), np.array(self.coefficients)
-        maps = cv2.initUndistortRectifyMap(matrix, told, None, pinhole.intrinsics, pinhole.size, cv2.CV_32FC1)
+        matrix, coefficients = matrix_of(self.focal_px, self.center_px), np.array(self.coefficients)
+        maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, pinhole.intrinsics, pinhole.size, cv2.CV_32FC1)
         return np.dstack(maps)
 
 
@@ -120,9 +120,9 @@ class FisheyeModel(CameraModel):
 
     def of_pixels(self, pinhole: Pinhole) -> NDArray[np.float32]:
         """Pixels of a pinhole's pixels, (H, W, 2) float32."""
-        matrix, told = matrix_of(self.focal_px, self.center_px), np.array(self.coefficients)
+        matrix, coefficients = matrix_of(self.focal_px, self.center_px), np.array(self.coefficients)
         maps = cv2.fisheye.initUndistortRectifyMap(
-            matrix, told, np.eye(3), pinhole.intrinsics, pinhole.size, cv2.CV_32FC1
+            matrix, coefficients, np.eye(3), pinhole.intrinsics, pinhole.size, cv2.CV_32FC1
         )
         return np.dstack(maps)
 
@@ -133,8 +133,8 @@ MODELS: dict[str, type[CameraModel]] = {model.name: model for model in (OpenCVMo
 
 def is_same_shape(size: Sequence[float], other: Sequence[float]) -> bool:
     """Whether one scale leads from a size to another, each of whose sides may be rounded by less than a pixel."""
-    apart = abs(other[0] / size[0] - other[1] / size[1])
-    return apart < 1 / size[0] + 1 / size[1]
+    difference = abs(other[0] / size[0] - other[1] / size[1])
+    return difference < 1 / size[0] + 1 / size[1]
 
 
 def scaled_intrinsics(
@@ -182,8 +182,8 @@ def model_from_json(value: Mapping[str, Any]) -> tuple[CameraModel, Size]:
     Raises:
         KeyError, TypeError, ValueError, OverflowError: for anything else.
     """
-    told = pinhole_from_json(value)
-    model = MODELS[value["opencv"]](told.focal_px, told.center_px, value["coefficients"])
+    pinhole = pinhole_from_json(value)
+    model = MODELS[value["opencv"]](pinhole.focal_px, pinhole.center_px, value["coefficients"])
     if len(model.coefficients) not in model.counts or not all(map(math.isfinite, model.coefficients)):
         raise ValueError(f"coefficients {model.coefficients}")
-    return model, told.size
+    return model, pinhole.size

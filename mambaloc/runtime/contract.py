@@ -16,8 +16,8 @@ from mambaloc.runtime.undistortion import Undistortion
 from mambaloc.runtime.world import World
 
 VERSION = 1
-_MOST_PIXELS = 8192  # of a side
-MOST_ENLARGED = 4
+_MAX_PIXELS = 8192  # of a side
+MAX_ENLARGEMENT = 4
 """How many times as large as the training camera's images another camera's are made at most; it bounds the memory."""
 METADATA_KEY = "mambaloc"
 IMAGE_INPUT = "image"
@@ -141,9 +141,9 @@ class Contract:
             intrinsics: (3, 3) pinhole matrix in pixels of the cropped image.
         """
         assert self.intrinsics is not None  # of a model that takes them
-        told = self.preprocessing
+        preprocessing = self.preprocessing
         as_large = round(min(size) * self.intrinsics[0][0] / np.asarray(intrinsics)[0, 0])
-        return replace(told, short_side=min(max(as_large, 1), MOST_ENLARGED * told.short_side))
+        return replace(preprocessing, short_side=min(max(as_large, 1), MAX_ENLARGEMENT * preprocessing.short_side))
 
     def to_json(self) -> str:
         """Write it down, with what its input looks like for those who read no code."""
@@ -187,8 +187,8 @@ class Contract:
                 )
             height, width = map(int, preprocessing["crop"])
             short_side = int(preprocessing["short_side"])
-            if not all(1 <= pixels <= _MOST_PIXELS for pixels in (height, width, short_side)):
-                raise ValueError(f"pixels go from 1 to {_MOST_PIXELS}")
+            if not all(1 <= pixels <= _MAX_PIXELS for pixels in (height, width, short_side)):
+                raise ValueError(f"pixels go from 1 to {_MAX_PIXELS}")
             return cls(
                 str(data["model"]),
                 str(data["scene"]),

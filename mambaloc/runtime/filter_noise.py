@@ -54,8 +54,8 @@ class Noise:
             quaternion: (N, 4), unit.
         """
         step_s = max(float(np.median(np.diff(time_s))), 1e-6)
-        apart = int(np.clip(round(0.25 / step_s), 1, (len(time_s) - 1) // 2))
-        first, middle, last = slice(None, -2 * apart), slice(apart, -apart), slice(2 * apart, None)
+        lag = int(np.clip(round(0.25 / step_s), 1, (len(time_s) - 1) // 2))
+        first, middle, last = slice(None, -2 * lag), slice(lag, -lag), slice(2 * lag, None)
         before_s, after_s = time_s[middle] - time_s[first], time_s[last] - time_s[middle]
         whole_s = np.maximum(before_s + after_s, 1e-6)
         share = (before_s / whole_s)[:, None]

@@ -85,8 +85,8 @@ class Localizer:
     @property
     def undistortion(self) -> Undistortion:
         """How the training images were made of what their camera stored: as the network has it, or else the map."""
-        told = [each.undistortion for each in (self.contract, self.sparse_map) if each is not None]
-        return next((each for each in told if each.lens is not None), told[0])
+        undistortions = [each.undistortion for each in (self.contract, self.sparse_map) if each is not None]
+        return next((each for each in undistortions if each.lens is not None), undistortions[0])
 
     @property
     def _place(self) -> Contract | SparseMap:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-_MOST_BYTES = 1 << 26  # of moov: tables of hours
+_MAX_BYTES = 1 << 26  # of moov: tables of hours
 _HDR = {16: "PQ", 18: "HLG"}
 
 
@@ -33,10 +33,10 @@ def read_about(path: Path) -> About:
         moov = _moov(path)
         ticks_hz = next((_ticks_hz(moov[a:b]) for kind, a, b in _boxes(moov) if kind == b"mvhd"), 0)
         tracks = [moov[a:b] for kind, a, b in _boxes(moov) if kind == b"trak"]
-        picture = next((track for track in tracks if b"vide" in track), b"")
-        edits = [_shown_ticks(part[a:b]) for part in _inside(picture, b"edts") for kind, a, b in _boxes(part)]
-        at = picture.find(b"colrnclx")
-        transfer = struct.unpack_from(">H", picture, at + 10)[0] if at >= 0 else 0
+        video_track = next((track for track in tracks if b"vide" in track), b"")
+        edits = [_shown_ticks(part[a:b]) for part in _inside(video_track, b"edts") for kind, a, b in _boxes(part)]
+        at = video_track.find(b"colrnclx")
+        transfer = struct.unpack_from(">H", video_track, at + 10)[0] if at >= 0 else 0
         return About(edits[0] / ticks_hz if edits and edits[0] and ticks_hz else None, _HDR.get(transfer))
     except (OSError, struct.error):
         return About()
@@ -55,7 +55,7 @@ def _moov(path: Path) -> bytes:
             if length == 1:
                 (length,), skip = struct.unpack_from(">Q", head, 8), 16
             length = size - at if length == 0 else length
-            if kind == b"moov" and length <= _MOST_BYTES:
+            if kind == b"moov" and length <= _MAX_BYTES:
                 file.seek(at + skip)
                 return file.read(length - skip)
             if length < 8:

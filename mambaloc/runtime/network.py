@@ -96,8 +96,8 @@ class Network:
         outputs = [output.name for output in self._session.get_outputs()]
         if outputs != list(self.contract.outputs):
             raise InputError(f"{self.path}: outputs {outputs} do not match its contract. Export the model again.")
-        told, (given, *others) = self.contract.preprocessing, self._session.get_inputs()
-        expected = ("tensor(uint8)", [3]) if told.in_model else ("tensor(float)", [3, *told.crop])
+        preprocessing, (given, *others) = self.contract.preprocessing, self._session.get_inputs()
+        expected = ("tensor(uint8)", [3]) if preprocessing.in_model else ("tensor(float)", [3, *preprocessing.crop])
         if (given.type, given.shape[-len(expected[1]) :]) != expected:
             raise InputError(
                 f"{self.path}: input {given.type} {given.shape} does not match its contract. Export the model again."

@@ -14,9 +14,10 @@ import cv2
 
 from mambaloc.errors import InputError, InputWarning
 from mambaloc.images import IMAGE_SUFFIXES, Counts, Image, is_image, list_images, read_image
+from mambaloc.renamed import renamed_arguments
 from mambaloc.runtime.mp4 import read_about
 
-PICTURES_HZ = 30.0
+IMAGES_HZ = 30.0
 """The rate at which a folder's images are taken to follow one another, as their files do not say it."""
 
 
@@ -35,8 +36,9 @@ class SourceFrame:
     image: Image
 
 
+@renamed_arguments(pictures_hz="images_hz")
 def frames_of(
-    source: str | Path, pictures_hz: float = PICTURES_HZ, counts: Counts | None = None, is_upright: bool = True
+    source: str | Path, images_hz: float = IMAGES_HZ, counts: Counts | None = None, is_upright: bool = True
 ) -> tuple[Iterator[SourceFrame], int | None]:
     """Open a source; return its frames, and about how many there are where that is known.
 
@@ -46,15 +48,15 @@ def frames_of(
     Args:
         source: a video file, an image, a folder of images (in natural order of their names), or the number of a
             camera, where no file or folder has that name.
-        pictures_hz: frames per second of a folder of images; a video and a camera have their own times.
+        images_hz: frames per second of a folder of images; a video and a camera have their own times.
         counts: black and white of 16-bit images, as :func:`~mambaloc.images.read_image` takes them.
         is_upright: turn a video's frames as the video asks; otherwise they are as it stores them.
 
     Raises:
-        InputError: where there is no such source, it is empty, or ``pictures_hz`` is not positive.
+        InputError: where there is no such source, it is empty, or ``images_hz`` is not positive.
     """
-    if not 0 < pictures_hz < math.inf:
-        raise InputError(f"pictures_hz={pictures_hz}: must be a positive number of frames per second; correct it")
+    if not 0 < images_hz < math.inf:
+        raise InputError(f"images_hz={images_hz}: must be a positive number of frames per second; correct it")
     path = Path(source)
     if path.is_dir():
         paths = list_images(path)
@@ -62,13 +64,13 @@ def frames_of(
             raise InputError(
                 f"{path}: contains no image ({', '.join(IMAGE_SUFFIXES)}); give a folder of images or a video"
             )
-        return _of_images(paths, pictures_hz, counts), len(paths)
+        return _of_images(paths, images_hz, counts), len(paths)
     if not path.is_file():
         if str(source).isdecimal():
             return _of_capture(_opened(int(str(source)), f"camera {source}"), live=True), None
         raise InputError(f"{path}: no such file, folder or camera; a camera is a number, as 0")
     if is_image(path):  # else FFmpeg would take one tile of a phone's HEIC for a video
-        return _of_images([path], pictures_hz, counts), 1
+        return _of_images([path], images_hz, counts), 1
     capture = _opened(str(path), str(path))
     if not is_upright:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)

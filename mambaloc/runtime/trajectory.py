@@ -8,7 +8,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 
 
 def decimal(number: float) -> str:
@@ -40,5 +40,5 @@ def write_tum(path: Path, time_s: Iterable[float | Decimal], position_m: Any, qu
     rows = zip(time_s, position_m.tolist(), quaternion.tolist(), strict=True)
     posed = (row for row in rows if any(row[2]) and all(map(isfinite, (*row[1], *row[2]))))
     lines = [" ".join([stamp(t), *map(decimal, (*xyz, qx, qy, qz, qw))]) for t, xyz, (qw, qx, qy, qz) in posed]
-    with writing(path), whole_file(path) as partial:
+    with writing(path), atomic_file(path) as partial:
         partial.write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n", encoding="utf-8")

@@ -61,13 +61,15 @@ class _Metrics:
 
     def __init__(self, workers: Workers) -> None:
         self.registry = CollectorRegistry()
-        told: dict[str, Any] = {"registry": self.registry, "namespace": "mambaloc"}
-        self.requests = Counter("requests", "Requests to localize, by bundle and status", ("bundle", "status"), **told)
-        self.pictures = Counter("pictures", "Images, by bundle and what answered", ("bundle", "source"), **told)
-        self.seconds = Histogram("picture_seconds", "Of an image, waiting included", ("bundle",), **told)
-        self.waiting = Gauge("pictures_waiting", "Images that are localized or wait for it", **told)
-        Gauge("workers", "Worker processes", **told).set(workers.count)
-        replaced = Gauge("workers_replaced", "Workers that died or took too long", **told)
+        options: dict[str, Any] = {"registry": self.registry, "namespace": "mambaloc"}
+        self.requests = Counter(
+            "requests", "Requests to localize, by bundle and status", ("bundle", "status"), **options
+        )
+        self.pictures = Counter("pictures", "Images, by bundle and what answered", ("bundle", "source"), **options)
+        self.seconds = Histogram("picture_seconds", "Of an image, waiting included", ("bundle",), **options)
+        self.waiting = Gauge("pictures_waiting", "Images that are localized or wait for it", **options)
+        Gauge("workers", "Worker processes", **options).set(workers.count)
+        replaced = Gauge("workers_replaced", "Workers that died or took too long", **options)
         replaced.set_function(lambda: workers.replaced)
 
 
@@ -83,7 +85,7 @@ class _Endpoints:
         try:
             response = JSONResponse(await self._answers(request, name))
         except HTTPException as error:
-            response = await told(request, error)
+            response = await error_response(request, error)
         known = name if name in self.workers.scenes else ""
         self.metrics.requests.labels(known, response.status_code).inc()
         return response
@@ -109,11 +111,11 @@ class _Endpoints:
         intrinsics = _intrinsics(request.query_params.get("intrinsics"))
         is_distorted = self._is_distorted(request.query_params.get("distorted"), intrinsics)
         is_form = request.headers.get("content-type", "").startswith(_MULTIPART)
-        pictures = await _within(_BODY_S, self._pictures(request, is_form))
-        if self.waiting + len(pictures) > self.limits.waiting:
+        images = await _within(_BODY_S, self._images(request, is_form))
+        if self.waiting + len(images) > self.limits.waiting:
             raise HTTPException(503, f"{self.waiting} images are waiting. Try again later.", {"Retry-After": "1"})
         answers = await asyncio.gather(
-            *(self._localized(Task(name, each, intrinsics, is_distorted)) for each in pictures)
+            *(self._localized(Task(name, each, intrinsics, is_distorted)) for each in images)
         )
         if is_form:
             return {"pictures": answers}
@@ -131,7 +133,7 @@ class _Endpoints:
             raise HTTPException(400, "distorted: distorted images have the intrinsics of their lens. Leave out one.")
         return text == "true"
 
-    async def _pictures(self, request: Request, is_form: bool) -> list[bytes]:
+    async def _images(self, request: Request, is_form: bool) -> list[bytes]:
         if not is_form:
             return [b"".join([chunk async for chunk in self._limited(request)])]
         # The form's fields are files of any name; others are refused.
@@ -155,8 +157,8 @@ class _Endpoints:
         async for chunk in request.stream():
             size += len(chunk)
             if size > self.limits.body_bytes:
-                most = self.limits.body_bytes / 2**20
-                raise HTTPException(413, f"body: is larger than {most:g} MiB. Give smaller images, or fewer.")
+                max_mib = self.limits.body_bytes / 2**20
+                raise HTTPException(413, f"body: is larger than {max_mib:g} MiB. Give smaller images, or fewer.")
             yield chunk
 
     async def _localized(self, task: Task) -> Answer:
@@ -210,7 +212,7 @@ def create_app(workers: Workers, limits: Limits | None = None, token: str | None
             Route("/metrics", endpoints.prometheus),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)],
-        exception_handlers={HTTPException: told},  # type: ignore[dict-item]
+        exception_handlers={HTTPException: error_response},  # type: ignore[dict-item]
         lifespan=lifespan,
     )
 
@@ -261,7 +263,7 @@ def serve_bundles(
         uvicorn.Server(config).run(sockets=[listening])
 
 
-async def told(request: Request, error: HTTPException) -> JSONResponse:
+async def error_response(request: Request, error: HTTPException) -> JSONResponse:
     """A mistake as JSON."""
     return JSONResponse({"error": error.detail}, error.status_code, error.headers)
 

@@ -29,7 +29,7 @@ from mambaloc.runtime import Localizer
 from mambaloc.runtime.localization import Localization
 
 _TRIES = 3
-_MOST_TOGETHER = 4  # images; with more, an image takes no less time
+_MAX_BATCH = 4  # images; with more, an image takes no less time
 _START_S = 120.0
 _ENVIRONMENT = {  # of a worker: it has a core, and the memory of images that cameras take
     "OMP_NUM_THREADS": "1",
@@ -83,8 +83,8 @@ def next_batch(waiting: deque[_Waiting], batched: Collection[str]) -> list[_Wait
     """
     batch = [waiting.popleft()]
     first = batch[0]
-    most = _MOST_TOGETHER if first.task.bundle in batched and not first.lost else 1
-    while waiting and len(batch) < most:
+    max_batch = _MAX_BATCH if first.task.bundle in batched and not first.lost else 1
+    while waiting and len(batch) < max_batch:
         task, following = first.task, waiting[0]
         if following.lost or (following.task.bundle, following.task.is_distorted) != (task.bundle, task.is_distorted):
             break

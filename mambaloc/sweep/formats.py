@@ -144,8 +144,8 @@ def _html_table(lines: list[list[str]]) -> str:
 
 
 def _html_row(tag: str, kind: str, kinds: Sequence[str], cells: Iterable[str]) -> str:
-    told = "".join(f"<{tag} class={each}>{cell}</{tag}>" for each, cell in zip(kinds, cells, strict=True))
-    return f"<tr class={kind}>{told}</tr>"
+    content = "".join(f"<{tag} class={each}>{cell}</{tag}>" for each, cell in zip(kinds, cells, strict=True))
+    return f"<tr class={kind}>{content}</tr>"
 
 
 def _is_number(text: str) -> bool:

@@ -71,7 +71,7 @@ def paper_tables(trials: Iterable[StoredTrial], epoch: str = "last") -> list[Pap
     for trial in trials:
         if trial.error is None and epoch in trial.results:
             by_basis.setdefault(_basis_of(trial, epoch), []).append(trial)
-    return [_table(name, told, by_basis, epoch) for name, told in printed_tables().items()]
+    return [_table(name, printed, by_basis, epoch) for name, printed in printed_tables().items()]
 
 
 @cache
@@ -82,7 +82,7 @@ def printed_tables() -> dict[str, dict[str, Any]]:
 
 def _basis_of(trial: StoredTrial, epoch: str) -> Basis:
     result = trial.results[epoch]
-    data, told = result["data"], result["model"]["hyperparameters"]
+    data, hyperparameters = result["data"], result["model"]["hyperparameters"]
     train, test = frame_counts(result)
     if data["official_split"]:
         frames = "official split"
@@ -90,23 +90,23 @@ def _basis_of(trial: StoredTrial, epoch: str) -> Basis:
         frames = "rendered images, not the benchmark's"
     else:
         frames = f"{data['scene']} with a split of its own, {train} training and {test} test frames: not the benchmark"
-    network = f"{told.get('backbone', 'GoogLeNet')} at {data['image_size'][0]}x{data['image_size'][1]} px"
+    network = f"{hyperparameters.get('backbone', 'GoogLeNet')} at {data['image_size'][0]}x{data['image_size'][1]} px"
     others = tuple(f"{axis} {label}" for axis, label in trial.labels.items() if axis not in _PLACE)
     return Basis(data["dataset"], frames, network, others)
 
 
-def _table(name: str, told: dict[str, Any], by_basis: dict[Basis, list[StoredTrial]], epoch: str) -> PaperTable:
-    columns = told["columns"]
+def _table(name: str, printed: dict[str, Any], by_basis: dict[Basis, list[StoredTrial]], epoch: str) -> PaperTable:
+    columns = printed["columns"]
     sparsities = sorted({column.get("sparsity", "1") for column in columns} - {_ALL}, key=Fraction, reverse=True)
     lines, bases = [["Method", *(column["name"] for column in columns)]], dict[Basis, str]()
-    for row in told["rows"]:
+    for row in printed["rows"]:
         lines.append([f"{row['name']}, paper", *("" if figure is None else str(figure) for figure in row["printed"])])
         specs = [{"sparsity": "1", **row, **column} for column in columns]
         sizes = [_size(spec) for spec in specs]
         ours = []
         for basis, trials in by_basis.items():
             measured = [_ours(spec, trials, basis, sparsities, epoch) for spec in specs]
-            if basis.dataset == told["dataset"] and any(measured):
+            if basis.dataset == printed["dataset"] and any(measured):
                 letter = bases.setdefault(basis, ascii_lowercase[len(bases) % 26])
                 figures = [figure or size for figure, size in zip(measured, sizes, strict=True)]
                 ours.append([f"{row['name']}, ours [{letter}]", *figures])
@@ -116,7 +116,9 @@ def _table(name: str, told: dict[str, Any], by_basis: dict[Basis, list[StoredTri
         notes.append("±: standard deviation over seeds.")
     if any(column.get("what") == "mib" for column in columns):
         notes.append("Sizes of ours count what the published models carry too; mambaloc benchmark sizes prints both.")
-    return PaperTable(name, told["title"], lines, notes + told["footnotes"], len(lines) > 1 + len(told["rows"]))
+    return PaperTable(
+        name, printed["title"], lines, notes + printed["footnotes"], len(lines) > 1 + len(printed["rows"])
+    )
 
 
 def _ours(spec: dict[str, Any], trials: Sequence[StoredTrial], basis: Basis, sparsities: list[str], epoch: str) -> str:
@@ -127,10 +129,10 @@ def _ours(spec: dict[str, Any], trials: Sequence[StoredTrial], basis: Basis, spa
     scenes = _scenes(spec["scene"], trials, basis, epoch)
     wanted = [(scene, s) for scene in scenes for s in (sparsities if spec["sparsity"] == _ALL else [spec["sparsity"]])]
     for system in spec["systems"]:
-        told = [(trial.labels.get(SEED, ""), trial.results[epoch]) for trial in trials]
+        results = [(trial.labels.get(SEED, ""), trial.results[epoch]) for trial in trials]
         found = {
             (result["data"]["scene"], _sparsity(result), seed): result
-            for seed, result in told
+            for seed, result in results
             if _is(result, system, spec["gis"], spec.get("distilled", False))
         }
         seeds = [s for s in sorted({key[2] for key in found}) if all((*place, s) in found for place in wanted)]

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mambaloc.sweep.summary import ERRORS, Row, history
-from mambaloc.viz.curves import COLORS, Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
+from mambaloc.viz.curves import COLORS, Point, axis_limit, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
 
 NAMES = {"position_error_m": "median position (m)", "rotation_error_deg": "median rotation (°)"}
 
@@ -53,14 +53,16 @@ def plots_of(rows: Sequence[Row], series: str | None) -> list[Plot]:
         plots.append(Plot("Errors and training time", text, figure))
     text = "Share of test frames whose position error is at most so large; trained on the most frames, all seeds."
     figure = _panels(full, lambda axes, group: _cumulative(axes, group, series), _ERROR, "share of frames")
-    told = (np.array(trial["frames"][_POSITION]) for group in full.values() for row in group for trial in row.trials)
-    figure.axes[0].set(xlim=(0, most_shown(told)), ylim=(0, 1))
+    errors_m = (
+        np.array(trial["frames"][_POSITION]) for group in full.values() for row in group for trial in row.trials
+    )
+    figure.axes[0].set(xlim=(0, axis_limit(errors_m)), ylim=(0, 1))
     return [*plots, Plot("Errors frame by frame", text, figure)]
 
 
 def _on_most_frames(group: list[Row]) -> list[Row]:
-    most = max(row.train_frames for row in group)
-    return [row for row in group if row.train_frames == most]
+    max_frames = max(row.train_frames for row in group)
+    return [row for row in group if row.train_frames == max_frames]
 
 
 def _dots(rows: Sequence[Row], series: str | None) -> Figure:
@@ -69,9 +71,9 @@ def _dots(rows: Sequence[Row], series: str | None) -> Figure:
     colors = _colors(rows, series)
     for axes, name in zip(figure.subplots(1, len(ERRORS), sharey=True), ERRORS, strict=True):
         for row, place in zip(rows, places, strict=True):
-            told = row.errors[name]
-            ends = [[max(0.0, told.mean - told.low)], [max(0.0, told.high - told.mean)]]
-            axes.errorbar([told.mean], [place], xerr=ends, fmt="o", ms=4, lw=1, color=colors[_label(row, series)])
+            error = row.errors[name]
+            ends = [[max(0.0, error.mean - error.low)], [max(0.0, error.high - error.mean)]]
+            axes.errorbar([error.mean], [place], xerr=ends, fmt="o", ms=4, lw=1, color=colors[_label(row, series)])
         axes.set_xlabel(NAMES[name])
         axes.set_xlim(left=0)
         axes.grid(axis="x", color="#e5e7eb")
@@ -106,8 +108,8 @@ def _panels(
 def _by_frames(axes: Axes, group: list[Row], series: str | None) -> None:
     points: dict[str, list[Point]] = {}
     for row in group:
-        told = row.errors[_POSITION]
-        points.setdefault(_label(row, series), []).append(Point(row.train_frames, told.mean, told.low, told.high))
+        error = row.errors[_POSITION]
+        points.setdefault(_label(row, series), []).append(Point(row.train_frames, error.mean, error.low, error.high))
     plot_errors_by_frames(axes, points)
     if retrieved := sorted({(row.train_frames, error_m) for row in group for error_m in _retrieval(row)}):
         axes.plot(*zip(*retrieved, strict=True), color="#111827", lw=0.9, ls="--", zorder=1)

@@ -8,7 +8,7 @@ from statistics import geometric_mean, mean, stdev
 
 from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import BLOCK, LEVEL
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.sweep.formats import Section, as_csv, as_latex, as_markdown, as_page, as_svg
 from mambaloc.sweep.paper import paper_tables
 from mambaloc.sweep.plots import NAMES, plots_of
@@ -60,7 +60,7 @@ def write_report(
     ]
     if failed:
         sections.append(_failures(failed))
-    with whole_folder(out, "choose another folder with --out") as folder:
+    with atomic_folder(out, "choose another folder with --out") as folder:
         _write(folder, _introduction(rows, failed), sections)
     return rows, failed
 
@@ -171,10 +171,12 @@ def _reached(row: Row, reach_m: float | None) -> str:
         reach_m = retrieval["position_error_m"]
     if reach_m is None or not all(map(history, row.trials)):
         return ""
-    told = [seconds for seconds in row.reached_s(reach_m) if seconds is not None]
-    if not told:
+    reached_s = [seconds for seconds in row.reached_s(reach_m) if seconds is not None]
+    if not reached_s:
         return "never"
-    return _spread(told, 1) + ("" if len(told) == len(row.trials) else f" ({len(told)} of {len(row.trials)} seeds)")
+    return _spread(reached_s, 1) + (
+        "" if len(reached_s) == len(row.trials) else f" ({len(reached_s)} of {len(row.trials)} seeds)"
+    )
 
 
 def _references(rows: Sequence[Row]) -> Section:

@@ -118,7 +118,7 @@ class Store:
             seconds,
             ended,
         )
-        with self._told("free some space, and run the sweep again"), self._database:
+        with self._report_errors("free some space, and run the sweep again"), self._database:
             self._database.execute("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?)", row)
 
     def read(self) -> dict[str, StoredTrial]:
@@ -127,7 +127,7 @@ class Store:
         Raises:
             InputError: where the file is damaged.
         """
-        with self._told("put a copy in its place, or choose another --out"):
+        with self._report_errors("put a copy in its place, or choose another --out"):
             rows = self._database.execute(
                 "SELECT key, labels, args, error, results, seconds, ended FROM trials ORDER BY rowid"
             ).fetchall()
@@ -137,7 +137,7 @@ class Store:
             }
 
     @contextmanager
-    def _told(self, remedy: str) -> Iterator[None]:
+    def _report_errors(self, remedy: str) -> Iterator[None]:
         try:
             yield
         except (sqlite3.Error, ValueError, TypeError, RecursionError) as error:  # a damaged row is not JSON, or no text

@@ -263,8 +263,10 @@ def _difference(labels: dict[str, str], pairs: list[Pair]) -> Difference:
     errors = {}
     resampled = [_resamples(before) for before, _ in pairs]  # alike for the same frames, apart for other scenes
     for name in ERRORS:
-        told = [[_medians(result, name, rows) for result in pair] for pair, rows in zip(pairs, resampled, strict=True)]
-        errors[name] = _figure([after - before for before, after in told])
+        medians = [
+            [_medians(result, name, rows) for result in pair] for pair, rows in zip(pairs, resampled, strict=True)
+        ]
+        errors[name] = _figure([after - before for before, after in medians])
     reach = tuple(ratio for pair in pairs if (ratio := _reach_ratio(pair)) is not None)
     return Difference(labels, errors, tuple(_step_s(after) / _step_s(before) for before, after in pairs), reach)
 

@@ -83,18 +83,18 @@ def read_sweep(path: Path) -> Sweep:
     Raises:
         InputError: where the file is not a sweep, or names what does not exist.
     """
-    told = read_yaml(path, "give a sweep of trainings", "repair it")
-    if not isinstance(told, dict) or not isinstance(told.get("axes"), dict) or not told["axes"]:
+    content = read_yaml(path, "give a sweep of trainings", "repair it")
+    if not isinstance(content, dict) or not isinstance(content.get("axes"), dict) or not content["axes"]:
         raise InputError(f"{path}: has no 'axes'. Add axes with labels and their arguments.")
     for old, new in _RENAMED.items():
-        if old in told:
+        if old in content:
             raise InputError(f"{path}: '{old}' is now called '{new}'. Rename the key.")
-    if unknown := sorted(set(map(str, told)) - set(_KEYS)):
+    if unknown := sorted(set(map(str, content)) - set(_KEYS)):
         raise InputError(f"{path}: unknown key {', '.join(unknown)}; choose among {', '.join(_KEYS)}")
-    axes = {str(axis): _labels(path, str(axis), labels) for axis, labels in told["axes"].items()}
-    numbers = {name: _number(path, name, told.get(name, default)) for name, default in _NUMBERS.items()}
-    excluded = [_combination(path, axes, entry) for entry in told.get("exclude") or []]
-    trials = tuple(_trials(path, axes, _args(path, "common_args", told.get("common_args") or []), excluded))
+    axes = {str(axis): _labels(path, str(axis), labels) for axis, labels in content["axes"].items()}
+    numbers = {name: _number(path, name, content.get(name, default)) for name, default in _NUMBERS.items()}
+    excluded = [_combination(path, axes, entry) for entry in content.get("exclude") or []]
+    trials = tuple(_trials(path, axes, _args(path, "common_args", content.get("common_args") or []), excluded))
     if not trials:
         raise InputError(f"{path}: excludes every trial; exclude fewer")
     return Sweep(trials, **numbers)
@@ -115,8 +115,8 @@ def _trials(
         place = dict(zip(axes, labels, strict=True))
         if not any(entry.items() <= place.items() for entry in excluded):
             first, *others = (axes[axis][label] for axis, label in place.items())
-            said = (*first, *common, *itertools.chain(*others))
-            waiting[labels] = tuple(sorted(said, key=lambda arg: not arg.endswith(_FILES)))  # options come last
+            ordered = (*first, *common, *itertools.chain(*others))
+            waiting[labels] = tuple(sorted(ordered, key=lambda arg: not arg.endswith(_FILES)))  # options come last
     made: dict[tuple[str, ...], Trial] = {}
     while waiting:
         before = len(made)

@@ -14,10 +14,10 @@ from mambaloc.images import LUMA
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 from mambaloc.synthesis.splatting import Splatter
 
-LEAST_CORRELATION = 0.45
+MIN_CORRELATION = 0.45
 """Views that correlate less are not trained on."""
 
-_APART = 0.2  # see PosedDepth.apart: about as far as views lie from the frames
+_MIN_DISTANCE = 0.2  # see PosedDepth.distance: about as far as views lie from the frames
 _WINDOW_PX = 9
 _NOISE = 2.0  # grey levels, standard deviation
 _USUAL_SHARE = 0.75
@@ -46,7 +46,7 @@ class Quality:
     @property
     def share(self) -> float:
         """Share of views among the images to train on: three in four; none where the depth puts surfaces elsewhere."""
-        return _USUAL_SHARE if self.correlation >= LEAST_CORRELATION else 0.0
+        return _USUAL_SHARE if self.correlation >= MIN_CORRELATION else 0.0
 
     def describe(self) -> str:
         """In one line."""
@@ -65,7 +65,7 @@ def held_out_quality(source: PosedDepth, count: int = 40, device: torch.device |
     splatter = Splatter(source, device)
     rows = np.unique(np.linspace(0, len(source) - 1, min(count, len(source))).round().astype(int))
     poses, size = source.world_from_cam, (source.depth_m.shape[1], source.depth_m.shape[2])
-    allowed = source.apart(poses[rows]) > _APART
+    allowed = source.distance(poses[rows]) > _MIN_DISTANCE
     views, correlations, holes = [], [], []
     for row, may in zip(rows, allowed, strict=True):
         view = splatter.render(poses[[row]], source.intrinsics[[row]], size, may[None])

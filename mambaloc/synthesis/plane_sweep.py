@@ -83,11 +83,11 @@ class PlaneSweep:
         offset = np.linalg.norm(position_m - position_m[row], axis=1) / self.scale_m
         turn_deg = np.degrees(np.arccos(np.clip(forward @ forward[row], -1, 1)))
         best = self.settings.baseline
-        apart = np.abs(np.log(np.maximum(offset, 1e-9) / best)) + (turn_deg / _TYPICAL_TURN_DEG) ** 2
-        apart[(turn_deg > _FARTHEST_TURN_DEG) | (offset < best / 5) | (offset > 5 * best)] = np.inf
+        penalty = np.abs(np.log(np.maximum(offset, 1e-9) / best)) + (turn_deg / _TYPICAL_TURN_DEG) ** 2
+        penalty[(turn_deg > _FARTHEST_TURN_DEG) | (offset < best / 5) | (offset > 5 * best)] = np.inf
         chosen: list[int] = []
-        for other in np.argsort(apart, kind="stable").tolist():
-            if len(chosen) == self.settings.neighbours or not np.isfinite(apart[other]):
+        for other in np.argsort(penalty, kind="stable").tolist():
+            if len(chosen) == self.settings.neighbours or not np.isfinite(penalty[other]):
                 break
             steps = np.linalg.norm(position_m[chosen] - position_m[other], axis=1) / self.scale_m
             if (steps > best / 4).all():
@@ -98,8 +98,8 @@ class PlaneSweep:
         others = self.neighbours(row)
         if not others:
             return torch.full(self.images.shape[2:], torch.nan, device=self.device)
-        picture, *neighbours = self._normalized([row, *others])
-        costs = [self._cost(picture, row, image, other) for image, other in zip(neighbours, others, strict=True)]
+        reference, *neighbours = self._normalized([row, *others])
+        costs = [self._cost(reference, row, image, other) for image, other in zip(neighbours, others, strict=True)]
         volume = best_half(torch.stack(costs))
         volume = aggregated(volume, self.settings.small_step, self.settings.large_step)
         return 1 / between_planes(volume, self._inverse)
@@ -111,9 +111,9 @@ class PlaneSweep:
         variance = (self._around(colors * colors) - mean * mean).clamp(min=0)
         return (colors - mean) / (variance + _NOISE**2).sqrt()
 
-    def _cost(self, picture: Tensor, row: int, image: Tensor, other: int) -> Tensor:
+    def _cost(self, reference: Tensor, row: int, image: Tensor, other: int) -> Tensor:
         """How badly a neighbour, warped through each plane, fits an image, (D, h, w); NaN where it does not see."""
-        height, width = picture.shape[1:]
+        height, width = reference.shape[1:]
         other_from_cam = np.linalg.inv(self.world_from_cam[other]) @ self.world_from_cam[row]
         matrix = self.intrinsics[other] @ other_from_cam[:3, :3] @ np.linalg.inv(self.intrinsics[row])
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -126,7 +126,7 @@ class PlaneSweep:
         is_seen = (z > 1e-6) & (place.abs() <= 1).all(dim=1)
         grid = place.transpose(1, 2).reshape(1, -1, width, 2)
         warped = F.grid_sample(image[None], grid, padding_mode="border", align_corners=False)
-        off = (warped.reshape(3, -1, height, width) - picture[:, None]).abs_().mean(dim=0).clamp_(max=_LARGEST_COST)
+        off = (warped.reshape(3, -1, height, width) - reference[:, None]).abs_().mean(dim=0).clamp_(max=_LARGEST_COST)
         return self._around(off[:, None])[:, 0].masked_fill_(~is_seen.reshape(off.shape), torch.nan)
 
     def _around(self, values: Tensor) -> Tensor:
@@ -166,17 +166,17 @@ def _along(lines: Tensor, small_step: float, large_step: float) -> Tensor:
     costs = torch.empty_like(lines)
     costs[0] = before = lines[0]
     for number in range(1, len(lines)):
-        least = before.amin(dim=0, keepdim=True)
-        best = torch.minimum(before, least + large_step)
+        lowest = before.amin(dim=0, keepdim=True)
+        best = torch.minimum(before, lowest + large_step)
         best[1:] = torch.minimum(best[1:], before[:-1] + small_step)
         best[:-1] = torch.minimum(best[:-1], before[1:] + small_step)
-        before = torch.add(lines[number], best.sub_(least), out=costs[number])
+        before = torch.add(lines[number], best.sub_(lowest), out=costs[number])
     return costs
 
 
 def between_planes(volume: Tensor, inverse: Tensor) -> Tensor:
     """Inverse depth of the least cost, between planes by a parabola; (D, h, w), (D,) -> (h, w)."""
-    least = volume.argmin(dim=0).clamp(1, len(inverse) - 2)
-    before, at, after = (volume.gather(0, (least + step)[None])[0] for step in (-1, 0, 1))
+    cheapest = volume.argmin(dim=0).clamp(1, len(inverse) - 2)
+    before, at, after = (volume.gather(0, (cheapest + step)[None])[0] for step in (-1, 0, 1))
     offset = ((before - after) / (2 * (before - 2 * at + after)).clamp(min=1e-6)).clamp(-0.5, 0.5)
-    return inverse[0] + (least + offset) * (inverse[1] - inverse[0])
+    return inverse[0] + (cheapest + offset) * (inverse[1] - inverse[0])

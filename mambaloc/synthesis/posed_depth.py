@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import deprecated
 
 Floats = NDArray[np.floating[Any]]
 Rows = NDArray[np.integer[Any]] | NDArray[np.bool_]
@@ -38,11 +39,16 @@ class PosedDepth:
         known_m = self.depth_m[np.isfinite(self.depth_m)]
         return float(np.median(known_m)) if len(known_m) else np.nan
 
-    def apart(self, world_from_cam: Floats) -> Floats:
+    def distance(self, world_from_cam: Floats) -> Floats:
         """How differently cameras see: offset in median depths and turn of the view in radians, (V, 4, 4) -> (V, S)."""
         offset = np.linalg.norm(world_from_cam[:, None, :3, 3] - self.world_from_cam[:, :3, 3], axis=-1)
         turn_rad = np.arccos(np.clip(world_from_cam[:, :3, 2] @ self.world_from_cam[:, :3, 2].T, -1, 1))
         return np.hypot(offset / self.median_depth_m, turn_rad)
+
+    @deprecated("PosedDepth.apart is now distance. The old name is removed in the next release.")
+    def apart(self, world_from_cam: Floats) -> Floats:
+        """Call :meth:`distance` by its old name."""
+        return self.distance(world_from_cam)
 
     def select(self, rows: Rows) -> PosedDepth:
         """Select some rows."""

@@ -16,7 +16,7 @@ from mambaloc.runtime.rotations import (
 )
 from mambaloc.synthesis.posed_depth import Floats
 
-_MOST_POSES = 2000  # pairs are a matrix
+_MAX_POSES = 2000  # pairs are a matrix
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class PoseSampler:
     """
 
     def __init__(self, world_from_cam: Floats, scale_m: float, spread: Spread | None = None) -> None:
-        rows = np.linspace(0, len(world_from_cam) - 1, min(len(world_from_cam), _MOST_POSES)).round().astype(int)
+        rows = np.linspace(0, len(world_from_cam) - 1, min(len(world_from_cam), _MAX_POSES)).round().astype(int)
         self.spread, self.scale_m = spread or Spread(), scale_m
         self.position_m = world_from_cam[rows, :3, 3]
         self.quaternion = quaternion_from_matrix(world_from_cam[rows, :3, :3])
-        apart = np.linalg.norm(self.position_m[:, None] - self.position_m, axis=-1) / scale_m
+        distance = np.linalg.norm(self.position_m[:, None] - self.position_m, axis=-1) / scale_m
         turn_deg = np.degrees(2 * np.arccos(np.clip(np.abs(self.quaternion @ self.quaternion.T), 0, 1)))
-        crowd = ((apart < self.spread.crowd) & (turn_deg < self.spread.crowd_deg)).sum(axis=1)
+        crowd = ((distance < self.spread.crowd) & (turn_deg < self.spread.crowd_deg)).sum(axis=1)
         self.share = (1 / crowd) / (1 / crowd).sum()
-        self.is_near = (apart < self.spread.between) & (turn_deg < self.spread.between_deg)
+        self.is_near = (distance < self.spread.between) & (turn_deg < self.spread.between_deg)
 
     def draw(self, count: int, rng: np.random.Generator) -> Floats:
         """Draw poses, (``count``, 4, 4) ``world_from_cam``."""

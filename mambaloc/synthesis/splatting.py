@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mambaloc.renamed import renamed_arguments
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 
 FRAMES = 12
@@ -78,11 +79,11 @@ class Splatter:
         Returns:
             rows (V, N), of at most :data:`FRAMES`; -1 where no more may be taken.
         """
-        apart = self.source.apart(world_from_cam)
+        distance = self.source.distance(world_from_cam)
         if allowed is not None:
-            apart[~allowed] = np.inf
-        rows = np.argsort(apart, axis=1, kind="stable")[:, :FRAMES]
-        return np.where(np.isfinite(np.take_along_axis(apart, rows, axis=1)), rows, -1)
+            distance[~allowed] = np.inf
+        rows = np.argsort(distance, axis=1, kind="stable")[:, :FRAMES]
+        return np.where(np.isfinite(np.take_along_axis(distance, rows, axis=1)), rows, -1)
 
     def is_free(self, position_m: Floats) -> NDArray[np.bool_]:
         """Whether cameras may stand at points (V, 3): some frame sees past them, or none sees a surface before them."""
@@ -97,13 +98,14 @@ class Splatter:
         is_past = (surface_m > (1 + _SAME_SURFACE) * z).any(axis=1)
         return is_past | ~(z > (1 + _SAME_SURFACE) * surface_m).any(axis=1)
 
+    @renamed_arguments(most_holes="max_holes")
     def render(
         self,
         world_from_cam: Floats,
         intrinsics: Floats,
         size: tuple[int, int],
         allowed: NDArray[np.bool_] | None = None,
-        most_holes: float = 1.0,
+        max_holes: float = 1.0,
     ) -> Rendered:
         """Render views.
 
@@ -112,7 +114,7 @@ class Splatter:
             intrinsics: of the views, (V, 3, 3), in pixels of ``size``.
             size: (height, width) of the views.
             allowed: which frames each may be made from, (V, S); all unless given.
-            most_holes: a view with a larger share of holes is given up, wherever that shows, and is not filled.
+            max_holes: a view with a larger share of holes is given up, wherever that shows, and is not filled.
         """
         frames = self.nearest(world_from_cam, allowed)
         matrix, shift = between(self.source, frames, world_from_cam, intrinsics)
@@ -125,12 +127,12 @@ class Splatter:
         for start in range(0, len(frames), _AT_ONCE):
             some = slice(start, start + _AT_ONCE)
             each = [rows[rows >= 0] for rows in frames[some]]
-            views.append(self._views(each, to_view[some], to_frames[some], pixels, most_holes))
+            views.append(self._views(each, to_view[some], to_frames[some], pixels, max_holes))
         images, depth_m = (torch.cat(each) for each in zip(*views, strict=True))
         return Rendered(images, depth_m, depth_m.isnan().float().mean(dim=(1, 2)))
 
     def _views(
-        self, frames: list[NDArray[np.int64]], to_view: Tensor, to_frames: Tensor, pixels: Tensor, most_holes: float
+        self, frames: list[NDArray[np.int64]], to_view: Tensor, to_frames: Tensor, pixels: Tensor, max_holes: float
     ) -> tuple[Tensor, Tensor]:
         """Images (V, 3, H, W) and depth (V, H, W) of views.
 
@@ -139,15 +141,15 @@ class Splatter:
             to_view: what carries world points to its pixels times their depth, (V, 3, 4).
             to_frames: what carries its pixels times their depth to its frames' times theirs, (V, N, 3, 4).
             pixels: (3, H, W), homogeneous.
-            most_holes: see :meth:`render`.
+            max_holes: see :meth:`render`.
         """
         size = pixels.shape[1:]
         nearest = closed(torch.stack([self._z_buffer(*each, size) for each in zip(frames, to_view, strict=True)]))
         images, depth_m = nearest.new_zeros(len(frames), 3, *size), torch.full_like(nearest, torch.nan)
         shares = nearest.isinf().float().mean(dim=(1, 2))
-        for view in ((shares <= most_holes) & (shares < 1)).nonzero()[:, 0].tolist():
+        for view in ((shares <= max_holes) & (shares < 1)).nonzero()[:, 0].tolist():
             images[view], depth_m[view] = self._look_up(frames[view], to_frames[view], nearest[view], pixels)
-        is_kept = depth_m.isnan().float().mean(dim=(1, 2)) <= most_holes
+        is_kept = depth_m.isnan().float().mean(dim=(1, 2)) <= max_holes
         images[is_kept] = filled(images[is_kept], depth_m[is_kept, None].isfinite().to(images))
         return images.clamp_(0, 255).round_().byte(), depth_m
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mambaloc.console import progress
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.memory import release_pages
 from mambaloc.synthesis.posed_depth import Floats, PosedDepth
 from mambaloc.synthesis.sampling import PoseSampler, Spread
@@ -27,15 +27,15 @@ from mambaloc.synthesis.splatting import Splatter
 PART = 256
 """Views are kept so many at a time, so that an interrupted run goes on where it was."""
 
-MOST_HOLES = 0.5
+MAX_HOLES = 0.5
 """Share of a view's pixels that no frame sees, beyond which it is thrown away."""
 
 _VERSION = 5
 _NEAREST = 0.1  # median depths; nearer surfaces would fill the view with a few pixels of a frame
-_MOST_CROWDED = 0.02  # share of pixels nearer than that
+_MAX_CROWDED = 0.02  # share of pixels nearer than that
 _DRAWN = 64  # poses at once
 _RENDERED = 16  # of these at once, until there are enough
-_LEAST_KEPT = 0.02
+_MIN_KEPT = 0.02
 _REMEDY = "make room, or choose another folder"
 
 
@@ -118,8 +118,8 @@ def _name(source: PosedDepth, world_from_cam: Floats, *settings: object) -> str:
     digest = hashlib.sha256(f"{_VERSION} {source.digest()}".encode())
     digest.update(np.ascontiguousarray(world_from_cam, np.float64).tobytes())
     intrinsics, size, seed, spread = settings
-    told = [np.asarray(intrinsics).tolist(), size, seed, astuple(spread)]  # type: ignore[call-overload]
-    digest.update(json.dumps(told).encode())
+    digested = [np.asarray(intrinsics).tolist(), size, seed, astuple(spread)]  # type: ignore[call-overload]
+    digest.update(json.dumps(digested).encode())
     return digest.hexdigest()[:32]
 
 
@@ -133,7 +133,7 @@ def _accepted(
         poses = sampler.draw(_DRAWN, rng)
         tried += _DRAWN
         kept += islice(supported(splatter, poses, intrinsics, size), PART - len(kept))
-        if tried > PART and len(kept) < _LEAST_KEPT * tried:
+        if tried > PART and len(kept) < _MIN_KEPT * tried:
             raise InputError(
                 f"depth of {len(splatter.source)} frames: supports {len(kept)} of {tried} views. "
                 "Give depth to more frames, or do without views."
@@ -149,21 +149,21 @@ def supported(
     free = world_from_cam[splatter.is_free(world_from_cam[:, :3, 3])]
     for start in range(0, len(free), _RENDERED):
         poses = free[start : start + _RENDERED]
-        views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, most_holes=MOST_HOLES)
+        views = splatter.render(poses, np.repeat(intrinsics[None], len(poses), axis=0), size, max_holes=MAX_HOLES)
         crowded_share = (views.depth_m < _NEAREST * splatter.scale_m).float().mean(dim=(1, 2))
-        is_good = (views.hole_share <= MOST_HOLES) & (crowded_share <= _MOST_CROWDED)
+        is_good = (views.hole_share <= MAX_HOLES) & (crowded_share <= _MAX_CROWDED)
         for row in is_good.nonzero()[:, 0].tolist():
             yield views.images[row].cpu().numpy(), views.depth_m[row].half().cpu().numpy(), poses[row]
 
 
 def _write(folder: Path, views: Views) -> None:
-    with whole_folder(folder, _REMEDY) as partial:
+    with atomic_folder(folder, _REMEDY) as partial:
         for name in _FIELDS:
             np.save(partial / f"{name}.npy", getattr(views, name))
 
 
 def _join(parts: list[Path], count: int, folder: Path) -> None:
-    with whole_folder(folder, _REMEDY) as partial:
+    with atomic_folder(folder, _REMEDY) as partial:
         for name in _FIELDS:
             first = np.load(parts[0] / f"{name}.npy", mmap_mode="r")
             joined = np.lib.format.open_memmap(

@@ -16,7 +16,7 @@ from mambaloc.viz.png import write_png
 
 COLORS = {"test": "#d73027", "val": "#f39c12", "train": "#2166ac", "unused": "#b0b0b0"}
 _JUMP_COLOR = "#8e44ad"
-_MOST_ARROWS = 160
+_MAX_ARROWS = 160
 _ARROW = 0.06  # of the plot's side
 _MARGIN = 0.09  # so that arrows end inside
 _WIDTH_IN, _NARROWEST_IN = 7.0, 4.0
@@ -109,7 +109,7 @@ def _draw(
             panel.plot(*position[piece].T, color="#cccccc", linewidth=0.8, zorder=1)
     for row in jumps:
         panel.plot(*position[[row - 1, row]].T, color=_JUMP_COLOR, linewidth=1.0, linestyle="--", zorder=2)
-    shown = np.linspace(0, len(position) - 1, min(_MOST_ARROWS, len(position))).round().astype(int)
+    shown = np.linspace(0, len(position) - 1, min(_MAX_ARROWS, len(position))).round().astype(int)
     panel.quiver(
         *(*position[shown].T, *arrows[shown].T),
         color=[COLORS[each] for each in split[shown]],

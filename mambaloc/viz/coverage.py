@@ -29,11 +29,11 @@ _PLACES = 14  # across a square of the area that is drawn
 _REACH = 0.6  # of the key frames' spread; how far around them to look
 _NEIGHBOURS = 4  # key frames whose height and tilt a place takes
 _UPRIGHT_DEG = 25.0
-_MOST_GAPS = 3
+_MAX_GAPS = 3
 _COLORS = LinearSegmentedColormap.from_list("coverage", ("#b2182b", "#ef8a62", "#fee08b", "#66bd63", "#1a7837"))
 _POINT, _KEY_FRAME, _GAP = "#9a9a9a", "#1f3b6f", "#111111"
 _WIDTH_IN, _PLOT_IN = 8.0, 6.4
-_MOST_MARGIN = 0.5  # of the longer side of the places
+_MAX_MARGIN = 0.5  # of the longer side of the places
 
 
 @dataclass(frozen=True)
@@ -116,20 +116,20 @@ def gaps(found: Survey, walked: Floats) -> list[Gap]:
         found: the survey.
         walked: where the key frames are, (K, 2) in its plane; what is near them counts most.
     """
-    apart = np.sqrt(((found.places[:, None] - found.places) ** 2).sum(axis=2)) / found.step
+    distance = np.sqrt(((found.places[:, None] - found.places) ** 2).sum(axis=2)) / found.step
     off = np.sqrt(((found.places[:, None] - walked) ** 2).sum(axis=2)).min(axis=1)
-    nearby = np.exp(-((apart / 2) ** 2))
+    nearby = np.exp(-((distance / 2) ** 2))
     lost, known = (nearby @ _blurred(each) for each in ((1 - found.certainty) ** 2, found.certainty**2))
     region = lost * known * (1 - found.certainty) * np.exp(-((off / (2 * found.step)) ** 2))[:, None]
     chosen: list[Gap] = []
-    for _ in range(_MOST_GAPS):
+    for _ in range(_MAX_GAPS):
         place, heading = np.unravel_index(int(region.argmax()), region.shape)
         if found.certainty[place, heading] > 0.5:
             break
         angle = found.headings[heading]
         direction = np.array([np.cos(angle), np.sin(angle)])
         chosen.append(Gap(found.places[place], direction, float(found.matches[place, heading])))
-        region *= 1 - np.exp(-((apart[place, :, None] / 4) ** 4))
+        region *= 1 - np.exp(-((distance[place, :, None] / 4) ** 4))
     return chosen
 
 
@@ -184,9 +184,9 @@ def draw_coverage(sparse_map: SparseMap, found: Survey, chosen: list[Gap], path:
 def _limits(found: Survey, points: Floats) -> tuple[Floats, Floats]:
     """The places and most of the points; at most half as much again on each side."""
     low, high = found.places.min(axis=0) - found.step, found.places.max(axis=0) + found.step
-    most = _MOST_MARGIN * (high - low).max()
+    max_margin = _MAX_MARGIN * (high - low).max()
     outer_low, outer_high = np.quantile(points, (0.03, 0.97), axis=0)
-    return np.clip(outer_low, low - most, low), np.clip(outer_high, high, high + most)
+    return np.clip(outer_low, low - max_margin, low), np.clip(outer_high, high, high + max_margin)
 
 
 def upwards(world_from_cam: Floats) -> Floats:

@@ -76,7 +76,7 @@ def plot_cumulative(axes: Axes, errors: Mapping[str, NDArray[np.floating]]) -> N
     finish(axes)
 
 
-def most_shown(errors: Iterable[NDArray[np.floating]]) -> float:
+def axis_limit(errors: Iterable[NDArray[np.floating]]) -> float:
     """Where a cumulative plot ends: one lost frame would flatten the rest, so at the worst system's 95th percentile."""
     return max(float(np.percentile(each, _SHOWN)) for each in errors)
 

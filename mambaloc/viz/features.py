@@ -95,10 +95,10 @@ def draw_features(
     size_in = (count * _CELL_IN + 0.5, (1 + len(rows)) * (_CELL_IN * height / width + 0.06) + 0.5)
     figure = Figure(figsize=size_in, layout=ConstrainedLayoutEngine(compress=True, w_pad=0.02, h_pad=0.02, hspace=0))
     cells = figure.subplots(1 + len(rows), count, squeeze=False)
-    for line, (label, pictures) in enumerate((("", list(images)), *rows)):
+    for line, (label, row_images) in enumerate((("", list(images)), *rows)):
         cells[line, 0].set_ylabel(label, fontsize=9)
-        for axes, picture in zip(cells[line], pictures, strict=True):
-            axes.imshow(picture, interpolation="bilinear")
+        for axes, image in zip(cells[line], row_images, strict=True):
+            axes.imshow(image, interpolation="bilinear")
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
     figure.suptitle(title, fontsize=11)

@@ -122,14 +122,14 @@ def draw_heat_maps(images: NDArray[Any], rows: Sequence[BranchHeat], path: Path,
     for column, image in enumerate(images):
         _bare(figure.add_subplot(grid[0, 2 * column : 2 * column + 2])).imshow(image, interpolation="bilinear")
     for line, row in enumerate(rows, start=1):
-        told_m, told_deg = row.position_error_m.tolist(), row.rotation_error_deg.tolist()
+        errors_m, errors_deg = row.position_error_m.tolist(), row.rotation_error_deg.tolist()
         for column, image in enumerate(images):
             axes = [_bare(figure.add_subplot(grid[line, 2 * column + side])) for side in (0, 1)]
             _overlay(axes[0], image, row.position[column])
             _overlay(axes[1], image, row.orientation[column])
             head = ("position\n", "orientation\n") if line == 1 else ("", "")
-            axes[0].set_title(f"{head[0]}{told_m[column]:.2f} m", fontsize=9)
-            axes[1].set_title(f"{head[1]}{told_deg[column]:.1f}°", fontsize=9)
+            axes[0].set_title(f"{head[0]}{errors_m[column]:.2f} m", fontsize=9)
+            axes[1].set_title(f"{head[1]}{errors_deg[column]:.1f}°", fontsize=9)
             if column == 0:
                 axes[0].set_ylabel(row.label, fontsize=9)
     heat = ScalarMappable(Normalize(0, 1), _COLORS)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.images import CORNER_PX, Image
 from mambaloc.runtime.localization import Localization
 from mambaloc.runtime.maps import SparseMap
@@ -195,7 +195,7 @@ def rerun_recording(path: Path, scene: str, world: World | None = None) -> Itera
     check_recording(path)
     import rerun as rr
 
-    with writing(path, "choose another file with --rerun"), whole_file(path) as partial:
+    with writing(path, "choose another file with --rerun"), atomic_file(path) as partial:
         partial.touch()  # Rerun's own error would not say why
         stream = rr.RecordingStream("mambaloc")
         stream.save(partial, default_blueprint=_layout())

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file
+from mambaloc.files import atomic_file
 from mambaloc.geometry import matrix_from_quaternion
 from mambaloc.metrics import PoseErrorTable
 from mambaloc.viz.trajectory import TRUE_COLOR, box_around, means, medians
@@ -20,7 +20,7 @@ from mambaloc.viz.trajectory import TRUE_COLOR, box_around, means, medians
 _CONFIG = {
     "displaylogo": False,
     "responsive": True,
-    "showSendToCloud": False,  # plotly 7 shows a button that uploads the chart unless told not to
+    "showSendToCloud": False,  # plotly 7 shows a button that uploads the chart unless this is set
     "plotlyServerURL": "",
 }
 _REDS = ((0.0, "#fb9272"), (0.5, "#d7301f"), (1.0, "#67000d"))
@@ -49,8 +49,8 @@ def write_scene_page(
         raise InputError(f"{path.name}: needs plotly. Run pip install 'mambaloc[viz]'.") from None
     index = table.index.tolist()
     ours, theirs = [names[i] for i in index], [sequences[i] for i in index]
-    told = _told(ours, table.position_error_m.tolist(), table.rotation_error_deg.tolist())
-    figure = Figure(data=[_offsets(table, told), _true_path(table, theirs, ours), _predictions(table, told)])
+    labels = _labels(ours, table.position_error_m.tolist(), table.rotation_error_deg.tolist())
+    figure = Figure(data=[_offsets(table, labels), _true_path(table, theirs, ours), _predictions(table, labels)])
     figure.update_layout(
         template="plotly_white",
         scene=_view(table),
@@ -63,7 +63,7 @@ def write_scene_page(
     summary = f"{medians(table)}; {means(table)}; {len(index)} frames"
     heading, *details = title.split("\n")
     page = _PAGE.substitute(title=html.escape(heading), summary=html.escape("; ".join((*details, summary))), plot=plot)
-    with whole_file(path) as partial:
+    with atomic_file(path) as partial:
         partial.write_text(page, encoding="utf-8")
 
 
@@ -85,7 +85,7 @@ def _true_path(table: PoseErrorTable, sequences: Sequence[str], names: Sequence[
     )
 
 
-def _predictions(table: PoseErrorTable, told: Sequence[str]) -> Any:
+def _predictions(table: PoseErrorTable, labels: Sequence[str]) -> Any:
     from plotly.graph_objects import Scatter3d
 
     errors_deg = table.rotation_error_deg.cpu().numpy()
@@ -97,17 +97,17 @@ def _predictions(table: PoseErrorTable, told: Sequence[str]) -> Any:
         mode="markers",
         name="prediction",
         marker={"size": 3.5, "color": errors_deg, "cmin": 0, "cmax": top_deg, "colorscale": _REDS, "colorbar": bar},
-        text=told,
+        text=labels,
         hovertemplate="%{text}<extra></extra>",
     )
 
 
-def _told(names: Sequence[str], errors_m: Iterable[float], errors_deg: Iterable[float]) -> list[str]:
+def _labels(names: Sequence[str], errors_m: Iterable[float], errors_deg: Iterable[float]) -> list[str]:
     rows = zip(names, errors_m, errors_deg, strict=True)
     return [f"{html.escape(name)}<br>{error_m:.3f} m<br>{error_deg:.2f}°" for name, error_m, error_deg in rows]
 
 
-def _offsets(table: PoseErrorTable, told: Sequence[str]) -> Any:
+def _offsets(table: PoseErrorTable, labels: Sequence[str]) -> Any:
     """Thin lines from each true position to the predicted one; they end in its marker, so they show the same."""
     from plotly.graph_objects import Scatter3d
 
@@ -119,7 +119,7 @@ def _offsets(table: PoseErrorTable, told: Sequence[str]) -> Any:
         mode="lines",
         line=line,
         showlegend=False,
-        text=np.repeat(np.array(told, dtype=object), 3).tolist(),
+        text=np.repeat(np.array(labels, dtype=object), 3).tolist(),
         hovertemplate="%{text}<extra></extra>",
     )
 

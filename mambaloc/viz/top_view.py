@@ -15,7 +15,7 @@ from mambaloc.metrics import PoseErrorTable
 from mambaloc.viz.png import write_png
 from mambaloc.viz.trajectory import PREDICTED_COLOR, means, medians
 
-_WIDTH_IN, _LEAST_HEIGHT_IN, _MOST_HEIGHT_IN = 7.5, 2.0, 9.0
+_WIDTH_IN, _MIN_HEIGHT_IN, _MAX_HEIGHT_IN = 7.5, 2.0, 9.0
 
 
 def draw_top_view(table: PoseErrorTable, sequences: Sequence[str], path: Path, title: str) -> None:
@@ -35,7 +35,7 @@ def draw_top_view(table: PoseErrorTable, sequences: Sequence[str], path: Path, t
     low_m, high_m = np.nanmin(both_m, axis=0), np.nanmax(both_m, axis=0)  # frames without a pose are NaN
     margin_m = 0.04 * float((high_m - low_m).max()) or 1.0
     spans_m = high_m - low_m + 2 * margin_m
-    height_in = np.clip(_WIDTH_IN * spans_m[1] / spans_m[0], _LEAST_HEIGHT_IN, _MOST_HEIGHT_IN)
+    height_in = np.clip(_WIDTH_IN * spans_m[1] / spans_m[0], _MIN_HEIGHT_IN, _MAX_HEIGHT_IN)
     figure = Figure(figsize=(_WIDTH_IN, float(height_in) + 1.2), layout="constrained")
     axes = figure.add_subplot(
         aspect="equal",

@@ -59,7 +59,7 @@ def draw_views(source: PosedDepth, views: Views | None, quality: Quality, path: 
 
 def _at_new_poses(source: PosedDepth, views: Views) -> _Group:
     rows = _spread(len(source))
-    near = np.argsort(source.apart(views.world_from_cam), axis=0, kind="stable")[:_BESIDE, rows]
+    near = np.argsort(source.distance(views.world_from_cam), axis=0, kind="stable")[:_BESIDE, rows]
     return _Group(
         f"At new poses: real frames, and the {_BESIDE} views nearest to each",
         ("real", *["view"] * len(near)),

@@ -16,7 +16,7 @@ from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.models import Checkpoint, LitPoseRegressor
 from mambaloc.runtime import contract
 from mambaloc.runtime.maps import MAP_FILE, sparse_map
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 from mambaloc.zoo.loading import is_checkpoint, load, released_folder, released_map
 from mambaloc.zoo.manifest import MANIFEST_FILE, Manifest
 
@@ -82,7 +82,7 @@ def map_of(source: str) -> Path | None:
     folder = released_folder(source)
     if (path := released_map(folder)) is not None or Manifest.read(folder).scene != _EMBEDDED_SCENE:
         return path
-    return made_once(f"maps/embedded_room-{_versions()}", _build_embedded_map) / MAP_FILE
+    return cached_folder(f"maps/embedded_room-{_versions()}", _build_embedded_map) / MAP_FILE
 
 
 def _build_embedded_map(folder: Path) -> None:
@@ -103,7 +103,7 @@ def released_bundle(name: str = EMBEDDED) -> Path:
     def make(partial: Path) -> None:
         write_bundle(*load_with_data(name), partial / "bundle", ("onnx",), target="pc", sparse_map=map_of(name))
 
-    return made_once(f"bundles/{manifest.model}-{digest}", make) / "bundle"
+    return cached_folder(f"bundles/{manifest.model}-{digest}", make) / "bundle"
 
 
 def _versions() -> str:

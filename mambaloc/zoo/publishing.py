@@ -20,7 +20,7 @@ from mambaloc.errors import InputError
 from mambaloc.evaluation import evaluate_checkpoint
 from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.export.maps import check_scene
-from mambaloc.files import sha256, whole_folder
+from mambaloc.files import atomic_folder, sha256
 from mambaloc.metrics import summarize
 from mambaloc.models import Checkpoint
 from mambaloc.models.registry import model_class
@@ -63,7 +63,7 @@ def publish(path: Path, tag: str, zoo: Path, accelerator: str = "auto", half: bo
         check_scene(sparse_map, SparseMap.load(sparse_map), data)
     with TemporaryDirectory() as scratch:
         measured = evaluate_checkpoint(checkpoint, Path(scratch), data, accelerator)
-    with whole_folder(folder, "choose another --zoo") as partial:
+    with atomic_folder(folder, "choose another --zoo") as partial:
         if sparse_map is not None:
             shutil.copyfile(sparse_map, partial / MAP_FILE)
         weights = save({name: _written(tensor, half) for name, tensor in system.network.state_dict().items()})

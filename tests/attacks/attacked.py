@@ -14,7 +14,7 @@ from pathlib import Path
 
 from subjects import Subject
 
-from mambaloc.console import exits_cleanly, quieten
+from mambaloc.console import configure_logging, exit_on_input_error
 
 SERVER = multiprocessing.get_context("forkserver")
 # Not the subjects themselves: before Python 3.12.8 the server knows nothing of pytest's paths, and does not say so.
@@ -40,7 +40,7 @@ def audited(below: Path, deed) -> None:
 
 def run(subject: Subject, inputs: Path, out: Path, attack, said) -> None:
     """In a process of its own: attack it, and send what it said and the steps that it took."""
-    quieten()
+    configure_logging()
     steps: list[int] = []
     audited(out, steps.append)
     attack(out)
@@ -48,7 +48,7 @@ def run(subject: Subject, inputs: Path, out: Path, attack, said) -> None:
     code = 0
     with contextlib.redirect_stderr(stderr), contextlib.redirect_stdout(io.StringIO()):
         try:
-            exits_cleanly(subject.make)(inputs, out)
+            exit_on_input_error(subject.make)(inputs, out)
         except SystemExit as end:
             code = end.code
     said.send((code, stderr.getvalue(), len(steps)))

@@ -38,7 +38,7 @@ def tally(request):
 
 
 @pytest.fixture(scope="session")
-def inputs(made_once, scenes, trained):
+def inputs(shared_folder, scenes, trained):
     """A scene, a capture of it, a recipe, a training, a sweep of two such, an ONNX model and a bundle."""
     from subjects import bundle, export
 
@@ -58,11 +58,11 @@ def inputs(made_once, scenes, trained):
         export(folder, folder)
         bundle(folder, folder)
 
-    return made_once("inputs of attacks", gather)
+    return shared_folder("inputs of attacks", gather)
 
 
 @pytest.fixture(scope="session")
-def undisturbed(made_once, inputs):
+def undisturbed(shared_folder, inputs):
     """``undisturbed(name)``: what a subject's operation comes to that nobody attacks; it runs once for all workers."""
     from attacked import Undisturbed, undisturbed_run
     from subjects import SUBJECTS
@@ -72,7 +72,7 @@ def undisturbed(made_once, inputs):
             found = undisturbed_run(SUBJECTS[name], inputs, folder / "out")
             (folder / "measured.json").write_text(json.dumps(asdict(found)))
 
-        return Undisturbed(**json.loads((made_once(f"undisturbed {name}", measure) / "measured.json").read_text()))
+        return Undisturbed(**json.loads((shared_folder(f"undisturbed {name}", measure) / "measured.json").read_text()))
 
     return run
 

@@ -50,7 +50,7 @@ def base_poses() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def drive(made_once):
+def drive(shared_folder):
     """A folder with the bag ``drive``, the scene ``den`` made of it, a tiny run on that, and its bundle with a map."""
 
     def make(folder: Path) -> None:
@@ -73,7 +73,7 @@ def drive(made_once):
         tool("evaluate", checkpoint, "--out", folder / "evaluated", "--accelerator", "cpu")
         tool("export", checkpoint, "--to", "onnx", "--no-raw-input", "--out", folder / "bundle")
 
-    return made_once("drive", make)
+    return shared_folder("drive", make)
 
 
 def evaluated(path: Path) -> dict[int, tuple[float, float]]:

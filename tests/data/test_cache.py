@@ -221,7 +221,7 @@ def test_of_several_shapes_the_middle_that_all_hold_is_kept(images, store):
     """The first is cropped, too, though the one that holds less comes later; resized sizes tell what was cropped."""
     cv2.imwrite(str(images[2]), noise(2, (24, 28)))
     cv2.imwrite(str(images[3]), noise(3, (40, 24)))
-    found = cached_frames(images, 24, BadFrames("error"), store, least=(20, 20))
+    found = cached_frames(images, 24, BadFrames("error"), store, min_size=(20, 20))
     assert found.sizes.tolist() == [[24, 32], [24, 32], [28, 24], [24, 40]]
     assert found.images.shape == (4, 3, 24, 24)
     expected = [noise(0)[:, 4:28], noise(1)[:, 4:28], noise(2, (24, 28))[2:26], noise(3, (40, 24))[:, 8:32]]
@@ -230,7 +230,7 @@ def test_of_several_shapes_the_middle_that_all_hold_is_kept(images, store):
 
 def test_a_shape_that_does_not_hold_the_least_is_bad(images, store):
     cv2.imwrite(str(images[2]), noise(2, (24, 28)))
-    found = cached_frames(images, 24, bad := BadFrames("skip"), store, least=(20, 30))
+    found = cached_frames(images, 24, bad := BadFrames("skip"), store, min_size=(20, 30))
     assert found.images.shape == (3, 3, 24, 32)
     assert bad.counts() == {"image is 24x28 after resizing, where the first is 32x24": 1}
 

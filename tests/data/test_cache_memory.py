@@ -36,7 +36,7 @@ def test_neither_building_nor_reading_maps_the_whole_file(tmp_path, monkeypatch)
     cameras = Cameras(np.tile(np.eye(3), (768, 1, 1)), np.full((768, 2), 256), is_assumed=True)
     data = CachedFrames(frames, found.images, cameras)
     for start in range(0, 768, 8):
-        assert (data.pictures(range(start, start + 8)) == 7).all()
+        assert (data.images_at(range(start, start + 8)) == 7).all()
     assert rss_of_files_kib() - before < 8 * 1024
 
 

@@ -35,7 +35,7 @@ def room():
 
 
 @pytest.fixture(scope="session")
-def room_with_depth(made_once):
+def room_with_depth(shared_folder):
     """A root with one scene, the embedded room: 40 training, 12 validation, 8 test frames, every other with depth."""
 
     def write(root):
@@ -43,13 +43,13 @@ def room_with_depth(made_once):
         shots = frames_of_sequences(walks, {3})
         write_7scenes(root, "room", shots, room=embedded_room(), size=SIZE, depth=True, depth_every=2)
 
-    return made_once("room_with_depth", write)
+    return shared_folder("room_with_depth", write)
 
 
 @pytest.fixture(scope="session")
-def view_cache(made_once):
+def view_cache(shared_folder):
     """A cache of the session, so that a set of views is made once."""
-    return made_once("view_cache", lambda folder: None)
+    return shared_folder("view_cache", lambda folder: None)
 
 
 @pytest.fixture(autouse=True)
@@ -334,7 +334,7 @@ def test_depth_that_cannot_be_used_gives_way_to_the_pictures_unless_it_was_asked
             make(root=root, cache_dir=str(tmp_path), view_depth="sensor").train_dataloader()
     from mambaloc.data.views import depth
 
-    monkeypatch.setattr(depth, "depth_from_pictures", stop_here)
+    monkeypatch.setattr(depth, "depth_from_images", stop_here)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         make(root=root, cache_dir=str(tmp_path)).train_dataloader()
@@ -348,7 +348,7 @@ def stop_here(*args, **options):
 
 
 def test_poor_views_are_left_out_and_the_training_goes_on(make, tmp_path, monkeypatch):
-    monkeypatch.setattr(gate, "LEAST_CORRELATION", 0.99)
+    monkeypatch.setattr(gate, "MIN_CORRELATION", 0.99)
     data, lines = lines_of(make, cache_dir=str(tmp_path), points_per_frame=8)
     assert len(lines) == 1
     assert "not worth training on. The training goes on without views." in lines[0]

@@ -38,29 +38,29 @@ def node():
 
 
 @pytest.fixture(scope="session")
-def bundle(made_once, scenes):
+def bundle(shared_folder, scenes):
     """A model that takes normalised tensors, and does not say how sure it is."""
-    return made_once("demo_bundle", lambda folder: _export(folder / "bundle", scenes, "heads")) / "bundle"
+    return shared_folder("demo_bundle", lambda folder: _export(folder / "bundle", scenes, "heads")) / "bundle"
 
 
 @pytest.fixture(scope="session")
-def raw_bundle(made_once, scenes):
+def raw_bundle(shared_folder, scenes):
     """Models that resize, crop and scale by themselves, and say how sure they are."""
 
     def make(folder):
         _export(folder / "bundle", scenes, "heads", ("onnx", "fp16"), raw_input=True, knows_its_frames=True)
 
-    return made_once("demo_raw_bundle", make) / "bundle"
+    return shared_folder("demo_raw_bundle", make) / "bundle"
 
 
 @pytest.fixture(scope="session")
-def map_bundle(made_once, den, map_of_den):
+def map_bundle(shared_folder, den, map_of_den):
     """A model and a map of the embedded room."""
 
     def make(folder):
         _export(folder / "bundle", den, "den", sparse_map=map_of_den, knows_its_frames=True)
 
-    return made_once("demo_map_bundle", make) / "bundle"
+    return shared_folder("demo_map_bundle", make) / "bundle"
 
 
 def _export(out, root, scene, formats=("onnx",), raw_input=False, knows_its_frames=False, sparse_map=None):
@@ -107,24 +107,24 @@ def modules():
 
 
 @pytest.fixture(scope="session")
-def site(made_once, bundle, film, modules):
-    return made_once("demo_site", lambda folder: build_site(bundle, folder / "site", film)) / "site"
+def site(shared_folder, bundle, film, modules):
+    return shared_folder("demo_site", lambda folder: build_site(bundle, folder / "site", film)) / "site"
 
 
 @pytest.fixture(scope="session")
-def raw_site(made_once, raw_bundle, modules):
-    return made_once("demo_raw_site", lambda folder: build_site(raw_bundle, folder / "site")) / "site"
+def raw_site(shared_folder, raw_bundle, modules):
+    return shared_folder("demo_raw_site", lambda folder: build_site(raw_bundle, folder / "site")) / "site"
 
 
 @pytest.fixture(scope="session")
-def map_site(made_once, map_bundle, film, modules):
-    return made_once("demo_map_site", lambda folder: build_site(map_bundle, folder / "site", film)) / "site"
+def map_site(shared_folder, map_bundle, film, modules):
+    return shared_folder("demo_map_site", lambda folder: build_site(map_bundle, folder / "site", film)) / "site"
 
 
 @pytest.fixture(scope="session")
-def lens_site(made_once, bundles_for_lenses, modules):
+def lens_site(shared_folder, bundles_for_lenses, modules):
     bundle = bundles_for_lenses / "tensors"
-    return made_once("demo_lens_site", lambda folder: build_site(bundle, folder / "site")) / "site"
+    return shared_folder("demo_lens_site", lambda folder: build_site(bundle, folder / "site")) / "site"
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mambaloc.images import read_image
 from mambaloc.runtime.maps import MapLocalizer, SparseMap
 from mambaloc.runtime.maps.absolute_pose import CameraPose, focal_scale, pose_covariance, refine_pose
-from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, MOST_DEVIATION, Evidence, is_another_focal_length
+from mambaloc.runtime.maps.acceptance import MAX_DEVIATION, MIN_PROBABILITY, Evidence, is_another_focal_length
 from mambaloc.runtime.maps.drift import Drift, fit_drift
 from mambaloc.runtime.maps.lens import Lens
 from mambaloc.runtime.rotations import rotation_error_deg
@@ -182,7 +182,7 @@ def test_focal_lengths_and_probabilities_are_pythons(solved):
         assert found["isAnother"] is is_another_focal_length(scale, deviation)
     for said, values in zip(answer["probabilities"], EVIDENCE, strict=True):
         assert said == pytest.approx(Evidence(*values).probability, abs=1e-12)
-    assert (answer["least"], answer["most"]) == (LEAST_PROBABILITY, MOST_DEVIATION)
+    assert (answer["least"], answer["most"]) == (MIN_PROBABILITY, MAX_DEVIATION)
 
 
 def adjusted(path, folder):

@@ -11,12 +11,12 @@ _convert = onnx_module._write
 
 
 @pytest.fixture(scope="module")
-def converted_once(made_once):
+def converted_once(shared_folder):
     """A network that is exported again, with the same contract, gets the same file; its parity is checked again."""
 
     def write(deployed, contract, path):
         name = "onnx " + hashlib.sha256(contract.to_json().encode()).hexdigest()  # has the weights' own digest in it
-        made = made_once(name, lambda folder: _convert(deployed, contract, folder / "model.onnx"))
+        made = shared_folder(name, lambda folder: _convert(deployed, contract, folder / "model.onnx"))
         shutil.copyfile(made / "model.onnx", path)
 
     with pytest.MonkeyPatch.context() as patch:

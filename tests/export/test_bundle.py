@@ -117,8 +117,8 @@ def test_a_map_is_described_with_poses_that_a_port_must_find(mapped, map_of_den,
     described = contract["map"]
     assert (described["points"], described["key_frames"]) == (len(sparse_map), len(sparse_map.key_poses))
     assert (described["scene"], described["size"], described["keypoints"]) == ("den", [160, 120], "sift")
-    assert described["accepted"]["least_probability"] == acceptance.LEAST_PROBABILITY
-    assert described["accepted"]["most_deviation"] == acceptance.MOST_DEVIATION
+    assert described["accepted"]["least_probability"] == acceptance.MIN_PROBABILITY
+    assert described["accepted"]["most_deviation"] == acceptance.MAX_DEVIATION
     assert described["accepted"]["calibrated_on"]["frames"] > 100
     assert described["allowed"] == {"position_mm": 10, "rotation_deg": 0.3}
     frames = data.frames("test")
@@ -215,17 +215,17 @@ def test_native_apps_decide_as_python_does():
         *(
             maps_localizer._NEAREST,
             *maps_localizer._WINDOWS,
-            maps_localizer._LEAST_SHARE,
+            maps_localizer._MIN_SHARE,
             maps_localizer._PRIOR_WINDOW,
             maps_localizer._SHARED,
         ),
-        *(acceptance._CELLS, acceptance.LEAST_PROBABILITY, acceptance.MOST_DEVIATION, localization._UNSTATED),
+        *(acceptance._CELLS, acceptance.MIN_PROBABILITY, acceptance.MAX_DEVIATION, localization._UNSTATED),
         *map(abs, (acceptance._CONSTANT, acceptance._PER_CELLS, acceptance._PER_DEVIATION, acceptance._PER_TURN)),
-        *(acceptance._LEAST_DEVIATION, acceptance._LEAST_TURN_DEG),
+        *(acceptance._MIN_DEVIATION, acceptance._MIN_TURN_DEG),
         *(acceptance._FOCAL_OFF, acceptance._FOCAL_DEVIATIONS),
         *(near_px(160), drift._LENGTH, drift.NUGGET, viewpoints._TURN_DEG, lens._STEPS),
         *(absolute_pose._TRIALS, absolute_pose._CONFIDENCE, absolute_pose._STEPS),
-        *(features._MOST_KEYPOINTS, features._CONTRAST, sparse_map.VERSION),
+        *(features._MAX_KEYPOINTS, features._CONTRAST, sparse_map.VERSION),
     }
     assert numbers - written == set()
 

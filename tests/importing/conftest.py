@@ -25,7 +25,7 @@ def room() -> Room:
 
 
 @pytest.fixture(scope="session")
-def rendered_once(made_once, request) -> Rendered:
+def rendered_once(shared_folder, request) -> Rendered:
     """Forty frames of a walk, distorted by OpenCV's own inverse of the lens; read only."""
     walk = embedded_walk(40, seed=3, start_deg=20.0, step_deg=2.4)
     center = ((SIZE[0] - 1) / 2 + 1.5, (SIZE[1] - 1) / 2 - 1.0)
@@ -35,17 +35,17 @@ def rendered_once(made_once, request) -> Rendered:
     def make(folder: Path) -> None:
         _write_rendered(request.getfixturevalue("room"), Rendered(folder, walk, matrix, coefficients))
 
-    return Rendered(made_once("rendered", make), walk, matrix, coefficients)
+    return Rendered(shared_folder("rendered", make), walk, matrix, coefficients)
 
 
 @pytest.fixture(scope="session")
-def imported_once(rendered_once, made_once) -> Path:
+def imported_once(rendered_once, shared_folder) -> Path:
     """The same as a scene's folder; read only."""
 
     def make(folder: Path) -> None:
         import_scene(rendered_once.folder, folder / "room", command="python tools/import_scene.py room")
 
-    return made_once("imported", make) / "room"
+    return shared_folder("imported", make) / "room"
 
 
 def _write_rendered(room: Room, rendered: Rendered) -> None:

@@ -37,18 +37,18 @@ QUERIES = range(2, 40, 5)  # frames of 40
 
 
 @pytest.fixture(scope="session")
-def mapped(imported_once, made_once) -> Path:
+def mapped(imported_once, shared_folder) -> Path:
     """The file of a map of the scene's training frames."""
 
     def make(folder: Path) -> None:
         train = read_frames(recipe_of(imported_once), "train")
         build_map(train, MapSettings(width=SIZE[0]), "room").save(folder / "map.safetensors")
 
-    return made_once("map with a lens", make) / "map.safetensors"
+    return shared_folder("map with a lens", make) / "map.safetensors"
 
 
 @pytest.fixture(scope="session")
-def queries(rendered_once, imported_once, made_once) -> Path:
+def queries(rendered_once, imported_once, shared_folder) -> Path:
     """``stored/``, ``copies/`` without distortion, and ``larger/``: the stored ones at twice their size."""
 
     def make(folder: Path) -> None:
@@ -61,7 +61,7 @@ def queries(rendered_once, imported_once, made_once) -> Path:
             twice = cv2.resize(cv2.imread(str(folder / "stored" / name)), None, fx=2, fy=2)
             cv2.imwrite(str(folder / "larger" / name), twice)
 
-    return made_once("queries of a lens", make)
+    return shared_folder("queries of a lens", make)
 
 
 def localize(*words: object) -> None:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mambaloc.importing import motion
-from mambaloc.importing.motion import apart
+from mambaloc.importing.motion import pairwise_distances
 
 
 def wxyz(rotation: Rotation):
@@ -19,7 +19,7 @@ def test_small_angles_keep_their_digits(angle_deg):
     start = Rotation.random(1, rng=np.random.default_rng(1))
     end = start * Rotation.from_rotvec([[0.0, np.radians(angle_deg), 0.0]])
     quaternion = np.concatenate((wxyz(start), -wxyz(end)))
-    _, turn_deg = apart(np.zeros((2, 3)), quaternion, np.array([0]), np.array([1]))
+    _, turn_deg = pairwise_distances(np.zeros((2, 3)), quaternion, np.array([0]), np.array([1]))
     assert turn_deg.item() == pytest.approx(angle_deg, rel=1e-7, abs=1e-13)
 
 
@@ -29,7 +29,7 @@ def test_every_pair_is_measured_whatever_the_block(monkeypatch, pairs_at_once):
     rng = np.random.default_rng(2)
     position, rotation = rng.normal(size=(9, 3)), Rotation.random(9, rng=rng)
     rows, others = np.array([8, 0, 3, 3, 5]), np.array([1, 3, 7, 2])
-    length, turn_deg = apart(position, wxyz(rotation), rows, others)
+    length, turn_deg = pairwise_distances(position, wxyz(rotation), rows, others)
     assert length.shape == turn_deg.shape == (5, 4)
     for i, row in enumerate(rows):
         for j, other in enumerate(others):

@@ -188,7 +188,7 @@ def test_films_and_folders_are_read_with_the_maps_camera(part, walk, tmp_path):
 
 
 def test_a_long_film_is_thinned(part, walk, tmp_path, monkeypatch):
-    monkeypatch.setattr("mambaloc.mapping.new_frames._MOST_FRAMES", 4)
+    monkeypatch.setattr("mambaloc.mapping.new_frames._MAX_FRAMES", 4)
     film = _film(tmp_path / "film.avi", [walk.frames.images[20]] * 10)
     assert [frame.name for frame in read_new_frames(film, MapLocalizer(part))] == ["0", "3", "6", "9"]
 

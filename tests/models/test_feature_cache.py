@@ -25,9 +25,9 @@ class Counting:
         return [image[:, :2], image.mean(dim=(2, 3), keepdim=True)]
 
 
-def cache_of(folder, most_bytes=EVERYTHING, key="k"):
+def cache_of(folder, max_bytes=EVERYTHING, key="k"):
     compute = Counting()
-    cache = FeatureCache(compute, torch.zeros(1, 3, 4, 5), ROWS, DRAWS, most_bytes, key, folder)
+    cache = FeatureCache(compute, torch.zeros(1, 3, 4, 5), ROWS, DRAWS, max_bytes, key, folder)
     compute.images = 0
     return cache, compute
 
@@ -61,7 +61,7 @@ def test_a_later_process_goes_on_where_another_was_killed(tmp_path):
 
 def test_what_finds_no_room_is_computed_each_time(tmp_path):
     bytes_an_image = 2 * (2 * 4 * 5 + 3)
-    cache, compute = cache_of(tmp_path, most_bytes=4 * bytes_an_image + 1)
+    cache, compute = cache_of(tmp_path, max_bytes=4 * bytes_an_image + 1)
     for _ in range(3):
         batch = batch_of(2, 3, 4, 5)
         assert_close(cache(batch, 0)[0], batch.image[:, :2], rtol=1e-3, atol=1e-3)

@@ -19,7 +19,7 @@ from mambaloc.geometry import canonical
 from mambaloc.images import as_rgb, read_image
 from mambaloc.models.student import LitStudent
 from mambaloc.runtime import Contract, Localizer, PoseFilter, Preprocessing, frames_of, smooth
-from mambaloc.runtime.sources import PICTURES_HZ
+from mambaloc.runtime.sources import IMAGES_HZ
 from mambaloc.runtime.video import localize_video
 
 DATA = {"dataset": "7scenes", "scene": "heads", "short_side": 48}
@@ -202,8 +202,8 @@ def test_a_folder_is_read_by_name(tmp_path):
     frames, count = frames_of(tmp_path)
     listed = list(frames)
     assert count == 2
-    assert [(frame.name, frame.time_s) for frame in listed] == [("a.png", 0.0), ("b.png", 1 / PICTURES_HZ)]
-    assert [frame.time_s for frame in frames_of(tmp_path, pictures_hz=8)[0]] == [0, 1 / 8]
+    assert [(frame.name, frame.time_s) for frame in listed] == [("a.png", 0.0), ("b.png", 1 / IMAGES_HZ)]
+    assert [frame.time_s for frame in frames_of(tmp_path, images_hz=8)[0]] == [0, 1 / 8]
     np.testing.assert_array_equal(listed[0].image[..., ::-1], picture(seed=0))
 
 
@@ -267,9 +267,9 @@ def test_a_source_is_localized_frame_by_frame(model, tmp_path):
         cv2.imwrite(str(tmp_path / name), picture(seed=seed)[..., ::-1])
     localizer = Localizer(model)
     found = list(localizer.localize_each(tmp_path))
-    assert [time_s for time_s, _ in found] == [0, 1 / PICTURES_HZ]
+    assert [time_s for time_s, _ in found] == [0, 1 / IMAGES_HZ]
     np.testing.assert_array_equal(found[1][1].position_m, localizer.localize(picture(seed=1)).position_m)
-    slower = localizer.localize_each(frames_of(tmp_path, pictures_hz=8)[0])
+    slower = localizer.localize_each(frames_of(tmp_path, images_hz=8)[0])
     assert [time_s for time_s, _ in slower] == [0, 1 / 8]
 
 
@@ -340,4 +340,4 @@ def test_what_is_no_source(tmp_path):
             frames_of(tmp_path / source)
     for rate_hz in (0, -1, float("nan"), float("inf")):
         with pytest.raises(InputError, match="must be a positive number of frames per second"):
-            frames_of(tmp_path, pictures_hz=rate_hz)
+            frames_of(tmp_path, images_hz=rate_hz)

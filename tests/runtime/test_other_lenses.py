@@ -15,7 +15,7 @@ from mambaloc.errors import InputError
 from mambaloc.export.preprocessing import with_preprocessing
 from mambaloc.images import read_image
 from mambaloc.runtime import Contract, Localizer, Preprocessing
-from mambaloc.runtime.contract import MOST_ENLARGED
+from mambaloc.runtime.contract import MAX_ENLARGEMENT
 from mambaloc.runtime.maps import SparseMap
 from mambaloc.runtime.network import Network
 
@@ -106,7 +106,7 @@ def test_things_are_as_large_as_the_training_camera_shows_them(lens):
 
 def test_the_widest_lens_is_enlarged_to_a_limit():
     preprocessing = CONTRACT.preprocessing_for((480, 640), camera(60, 320, 240))
-    assert preprocessing.short_side == MOST_ENLARGED * 108
+    assert preprocessing.short_side == MAX_ENLARGEMENT * 108
     assert CONTRACT.preprocessing_for((6, 8), camera(79, 4, 3)).short_side == 9
     assert CONTRACT.preprocessing_for((2, 190), camera(1850, 95, 1, fy=19)).short_side == 1
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from mambaloc.errors import InputError
-from mambaloc.synthesis import PlaneSweep, depth_from_pictures
-from mambaloc.synthesis.depth_from_pictures import range_from_pictures, range_of_points, spread_rows
+from mambaloc.synthesis import PlaneSweep, depth_from_images
+from mambaloc.synthesis.depth_from_images import range_from_images, range_of_points, spread_rows
 from mambaloc.synthesis.plane_sweep import aggregated, best_half, between_planes
 
 ROWS = np.array([5, 20, 35, 50])
@@ -60,7 +60,7 @@ def test_picture_without_neighbours_has_no_depth(denser_walk):
 
 def test_pictures_alone_bound_the_depth(denser_walk):
     walk = denser_walk
-    near_m, far_m = range_from_pictures(walk.images, walk.intrinsics, walk.world_from_cam)
+    near_m, far_m = range_from_images(walk.images, walk.intrinsics, walk.world_from_cam)
     nearest, farthest = np.nanquantile(walk.depth_m, [0.01, 0.99])
     assert nearest / 2.5 < near_m < nearest * 1.05
     assert farthest * 0.95 < far_m < farthest * 2.5
@@ -69,7 +69,7 @@ def test_pictures_alone_bound_the_depth(denser_walk):
 def test_what_several_pictures_confirm_is_right(denser_walk):
     walk = denser_walk.select(np.arange(40))
     points_m = np.random.default_rng(0).uniform((-3, -3, 0), (3, 3, 2.5), (4000, 3))
-    found = depth_from_pictures(walk.images, walk.intrinsics, walk.world_from_cam, points_m, key_frames=10)
+    found = depth_from_images(walk.images, walk.intrinsics, walk.world_from_cam, points_m, key_frames=10)
     rows = [int(np.abs(walk.world_from_cam - pose).sum(axis=(1, 2)).argmin()) for pose in found.world_from_cam]
     assert np.isfinite(found.depth_m).mean() > 0.4
     assert within(found.depth_m, walk.depth_m[rows], 0.05) > 0.87
@@ -79,7 +79,7 @@ def test_poses_that_do_not_fit_the_pictures_are_refused(denser_walk):
     walk = denser_walk.select(np.arange(0, 120, 3))
     shuffled = np.random.default_rng(0).permutation(len(walk))
     with pytest.raises(InputError, match="Check poses and cameras, or do without views"):
-        depth_from_pictures(
+        depth_from_images(
             walk.images[shuffled], walk.intrinsics, walk.world_from_cam, np.array([[0, 0, 1.0], [3, 3, 1]]), 8
         )
 

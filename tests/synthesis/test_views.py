@@ -9,7 +9,7 @@ import torch
 
 from mambaloc.errors import InputError
 from mambaloc.synthesis import Spread, make_views, views
-from mambaloc.synthesis.views import MOST_HOLES
+from mambaloc.synthesis.views import MAX_HOLES
 
 SIZE = (36, 48)
 
@@ -52,7 +52,7 @@ def test_views_are_arrays_on_disk_in_the_promised_form(twenty, camera):
 def test_views_show_what_the_renderer_sees_there(twenty, shoot_room):
     ratio = twenty.depth_m / shoot_room(twenty.world_from_cam).depth_m[:, ::2, ::2]  # pixels half a fine one apart
     assert np.median(np.abs(ratio[np.isfinite(ratio)] - 1)) < 0.02
-    assert np.isnan(twenty.depth_m).mean(axis=(1, 2)).max() <= MOST_HOLES
+    assert np.isnan(twenty.depth_m).mean(axis=(1, 2)).max() <= MAX_HOLES
 
 
 def test_interrupted_making_goes_on_and_ends_the_same(twenty, walk, camera, tmp_path, monkeypatch):

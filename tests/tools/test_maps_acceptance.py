@@ -10,7 +10,7 @@ from mambaloc.mapping import PosedFrames
 from mambaloc.mapping.building import MapSettings, build_map
 from mambaloc.rendering import default_intrinsics, embedded_room, embedded_walk, render
 from mambaloc.runtime.maps import MapLocalizer
-from mambaloc.runtime.maps.acceptance import MOST_DEVIATION
+from mambaloc.runtime.maps.acceptance import MAX_DEVIATION
 
 FIELDS = maps_acceptance._FIELDS
 
@@ -39,7 +39,7 @@ def test_coefficients_and_shares_of_drawn_evidence(tmp_path):
     assert lines[1].startswith("20000 frames, 20000 images")
     known = np.log(np.column_stack((rows[:, 4] + 0.5, rows[:, 5], rows[:, 6] + 0.1)))
     is_likely = coefficients[0] + known @ coefficients[1:] > np.log(0.95 / 0.05)
-    accepted = is_likely & (rows[:, 5] <= MOST_DEVIATION)
+    accepted = is_likely & (rows[:, 5] <= MAX_DEVIATION)
     assert accepted.sum() < 0.8 * is_likely.sum()
     (without_bound,) = [line for line in lines if line.startswith("deviations to inf")]
     assert int(without_bound.split("accepted")[1].split()[0]) == pytest.approx(is_likely.sum(), rel=0.05)

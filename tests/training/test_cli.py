@@ -14,7 +14,7 @@ from lightning import Trainer
 import mambaloc
 from mambaloc.cli import main, recipe_arguments
 from mambaloc.errors import InputError
-from mambaloc.refusals import tell_refusals
+from mambaloc.refusals import report_refusals
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -85,9 +85,9 @@ def test_mistake_is_one_line_and_exit_code_2(options, words, tiny_recipe, capsys
 
 
 def test_only_what_lightning_refuses_is_a_users_mistake():
-    with pytest.raises(InputError, match=r"trainer: Lightning refuses it .*max_epochs"), tell_refusals([]):
+    with pytest.raises(InputError, match=r"trainer: Lightning refuses it .*max_epochs"), report_refusals([]):
         Trainer(max_epochs=-2, logger=False)
-    with pytest.raises(ValueError, match="ours"), tell_refusals(["--trainer.max_epochs"]):
+    with pytest.raises(ValueError, match="ours"), report_refusals(["--trainer.max_epochs"]):
         raise ValueError("ours")
 
 

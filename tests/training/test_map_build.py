@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mambaloc.callbacks import MapBuild, map_build
 from mambaloc.cli import main
-from mambaloc.console import quieten
+from mambaloc.console import configure_logging
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.capture import COLUMNS
 from mambaloc.errors import InputError, InputWarning
@@ -67,7 +67,7 @@ def capture(den, tmp_path):
 def test_it_is_built_from_the_frames_that_are_trained_on_and_no_others(den, tmp_path, capsys):
     data = data_of(den, validation="block", val_fraction=0.2, val_gap=2)  # of 32: 24 to train on, 6 to validate on
     run = run_of(data, tmp_path)
-    quieten()  # as tools do: the log goes to stderr
+    configure_logging()  # as tools do: the log goes to stderr
     capsys.readouterr()
     MapBuild(enabled=True, **SETTINGS).on_fit_start(run, None)
     built = SparseMap.load(tmp_path / "map/map.safetensors")
@@ -101,7 +101,7 @@ def test_other_ranks_and_trial_runs_build_none(changed, den, tmp_path):
 
 
 def test_a_resumed_run_keeps_its_map_unless_frames_or_settings_changed(den, tmp_path, monkeypatch, capsys):
-    quieten()
+    configure_logging()
     built = []
     build = map_build.build_map
     monkeypatch.setattr(map_build, "build_map", lambda *args, **kwargs: built.append(args) or build(*args, **kwargs))

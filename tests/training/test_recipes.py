@@ -35,18 +35,18 @@ NARROW = {
 
 
 @pytest.fixture(scope="session")
-def cambridge(made_once):
+def cambridge(shared_folder):
     def render(root: Path) -> None:
         inside_m = ((-4.0, -4.0, 1.5), (4.0, 4.0, 2.5))
         sequences = {n: smooth_trajectory(6, seed=n, inside_m=inside_m) for n in (1, 2, 3)}
         shots = frames_of_sequences(sequences, {3}, FRAME_CAMBRIDGE)
         write_cambridge(root, "KingsCollege", shots, size=(96, 54), points=True)
 
-    return made_once("cambridge", render)
+    return shared_folder("cambridge", render)
 
 
 @pytest.fixture(scope="session")
-def teacher(made_once):
+def teacher(shared_folder):
     def save(folder: Path) -> None:
         trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
         trainer.strategy.connect(
@@ -54,7 +54,7 @@ def teacher(made_once):
         )
         trainer.save_checkpoint(folder / "best.ckpt")
 
-    return made_once("teacher_of_recipes", save) / "best.ckpt"
+    return shared_folder("teacher_of_recipes", save) / "best.ckpt"
 
 
 @pytest.fixture

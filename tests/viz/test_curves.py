@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from mambaloc.viz.curves import Point, most_shown, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
+from mambaloc.viz.curves import Point, axis_limit, plot_cumulative, plot_errors_by_frames, plot_errors_by_time
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def test_cumulative_curve_is_the_empirical_distribution(axes):
     for limit in (0.05, 0.2, 0.4):
         assert share[x <= limit][-1] == pytest.approx(np.mean(errors <= limit))
     assert x[np.argmax(share >= 0.5)] == pytest.approx(np.median(errors))  # where it meets the dotted line
-    assert most_shown([errors, errors / 2]) == pytest.approx(np.percentile(errors, 95))
+    assert axis_limit([errors, errors / 2]) == pytest.approx(np.percentile(errors, 95))
 
 
 def test_each_training_is_a_line_and_each_system_a_color(axes):

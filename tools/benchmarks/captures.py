@@ -14,13 +14,13 @@ from pathlib import Path
 
 from captures_read import count_one
 
-from mambaloc.console import OptionParser, exits_cleanly
+from mambaloc.console import OptionParser, exit_on_input_error
 
 COUNTED = ("captures", "refused", "tracebacks", "should", "read", "equal", "silent")
 """Captures, and frames: that should be read, that were, with their true pose, and with another or none."""
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Print counts by kind and in all, and what was refused."""
     parser = OptionParser(description=__doc__)
@@ -30,10 +30,10 @@ def main() -> None:
     by_kind: dict[str, Counter[str]] = {}
     for seed in range(args.seed, args.seed + args.count):
         with tempfile.TemporaryDirectory() as folder:
-            kind, counts, said = count_one(seed, Path(folder))
+            kind, counts, message = count_one(seed, Path(folder))
         by_kind[kind] = by_kind.get(kind, Counter()) + counts
-        if said or counts["silent"] or counts["equal"] < counts["should"]:
-            print(f"seed {seed}, {kind}: {dict(counts)} {said.replace(folder, '')}", flush=True)
+        if message or counts["silent"] or counts["equal"] < counts["should"]:
+            print(f"seed {seed}, {kind}: {dict(counts)} {message.replace(folder, '')}", flush=True)
     print(f"{'kind':16}", *(f"{name:>10}" for name in COUNTED))
     for kind, counts in [*by_kind.items(), ("all", sum(by_kind.values(), Counter()))]:
         print(f"{kind:16}", *(f"{counts[name]:10}" for name in COUNTED))

@@ -42,7 +42,7 @@ class Drawn:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content.replace("\n", self.newline).encode(self.encoding))
 
-    def picture(self, row: int, name: str) -> None:
+    def image(self, row: int, name: str) -> None:
         """Write a frame's image, perhaps with an orientation tag, and keep what is true of it."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from mambaloc.errors import InputError
 from mambaloc.importing.importer import import_scene
 
 WITHIN = 1e-6
-_ALIKE = 4.0  # of 255: what JPEG loses
+_MAX_DIFFERENCE = 4.0  # of 255: what JPEG loses
 
 
 def count_one(seed: int, folder: Path) -> tuple[str, Counter[str], str]:
@@ -31,8 +31,8 @@ def count_one(seed: int, folder: Path) -> tuple[str, Counter[str], str]:
         return kind, counts + Counter(refused=1), str(error)
     except Exception as error:  # a user would see its traceback
         return kind, counts + Counter(refused=1, tracebacks=1), f"{type(error).__name__}: {error}"
-    for picture, pose in _written(folder / "scene"):
-        path = _source_of(picture, drawn)
+    for image, pose in _written(folder / "scene"):
+        path = _source_of(image, drawn)
         truth = None if path is None else drawn.truth[path]
         is_equal = truth is not None and np.abs(pose - truth).max() <= WITHIN
         counts += Counter(read=1, equal=int(is_equal), silent=int(not is_equal))
@@ -52,10 +52,10 @@ def _written(scene: Path) -> list[tuple[Path, np.ndarray]]:
     return found
 
 
-def _source_of(picture: Path, drawn: Drawn) -> Path | None:
+def _source_of(image: Path, drawn: Drawn) -> Path | None:
     """The image that a written one was made of, by what it shows: names may have changed."""
-    shown = np.array(cv2.imread(str(picture), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), int)
-    alike = {path: stored for path, stored in drawn.pixels.items() if stored.shape == shown.shape}
-    off = {path: float(np.abs(stored - shown).mean()) for path, stored in alike.items()}
+    shown = np.array(cv2.imread(str(image), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), int)
+    same_shape = {path: stored for path, stored in drawn.pixels.items() if stored.shape == shown.shape}
+    off = {path: float(np.abs(stored - shown).mean()) for path, stored in same_shape.items()}
     nearest = min(off, key=off.__getitem__, default=None)
-    return nearest if nearest is not None and off[nearest] < _ALIKE else None
+    return nearest if nearest is not None and off[nearest] < _MAX_DIFFERENCE else None

@@ -30,10 +30,10 @@ def clock(drawn: Drawn) -> tuple[list[str], list[str]]:
     step = Decimal(int(drawn.rng.integers(30, 150))) / 1000
     times = [start + row * step + Decimal(763555555) / 10**9 for row in range(len(drawn.poses))]
     late = Decimal(int(drawn.rng.integers(0, 4))) / 1000
-    of_pictures, of_poses = (str(drawn.rng.choice(units)) for _ in range(2))
-    stems = [f"{t * PER_S[of_pictures]:.9f}" if of_pictures == "s" else f"{t * PER_S[of_pictures]:.0f}" for t in times]
-    digits = 9 if of_poses == "s" else int(drawn.rng.choice([0, 6]))
-    return stems, [f"{(t + late) * PER_S[of_poses]:.{digits}f}" for t in times]
+    image_unit, pose_unit = (str(drawn.rng.choice(units)) for _ in range(2))
+    stems = [f"{t * PER_S[image_unit]:.9f}" if image_unit == "s" else f"{t * PER_S[image_unit]:.0f}" for t in times]
+    digits = 9 if pose_unit == "s" else int(drawn.rng.choice([0, 6]))
+    return stems, [f"{(t + late) * PER_S[pose_unit]:.{digits}f}" for t in times]
 
 
 def tum(drawn: Drawn) -> None:
@@ -42,7 +42,7 @@ def tum(drawn: Drawn) -> None:
     lines = [f"{word} {drawn.words(row)}" for row, word in enumerate(words)]
     drawn.text(str(drawn.rng.choice(["trajectory.txt", "poses_est.txt", "run.tum"])), "\n".join(lines) + "\n")
     for row, stem in enumerate(stems):
-        drawn.picture(row, f"rgb/{stem}.png")
+        drawn.image(row, f"rgb/{stem}.png")
 
 
 def tum_rgbd(drawn: Drawn) -> None:
@@ -52,7 +52,7 @@ def tum_rgbd(drawn: Drawn) -> None:
     lines = [f"{word} {drawn.words(row)}" for row, word in enumerate(words)]
     drawn.text("groundtruth.txt", "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines))
     for row, stem in enumerate(stems):
-        drawn.picture(row, f"rgb/{stem}.png")
+        drawn.image(row, f"rgb/{stem}.png")
 
 
 def table_by_time(drawn: Drawn) -> None:
@@ -61,7 +61,7 @@ def table_by_time(drawn: Drawn) -> None:
     rows = [[word, *drawn.words(row, "wxyz").split()] for row, word in enumerate(words)]
     _table(drawn, ["timestamp", "x", "y", "z", "qw", "qx", "qy", "qz"], rows)
     for row, stem in enumerate(stems):
-        drawn.picture(row, f"images/{stem}.jpg")
+        drawn.image(row, f"images/{stem}.jpg")
 
 
 def table(drawn: Drawn) -> None:
@@ -73,7 +73,7 @@ def table(drawn: Drawn) -> None:
     shuffled = [rows[at] for at in drawn.rng.permutation(len(rows))]
     _table(drawn, ["image", "x", "y", "z", "qw", "qx", "qy", "qz"], shuffled)
     for row, name in enumerate(names):
-        drawn.picture(row, f"images/{name}")
+        drawn.image(row, f"images/{name}")
 
 
 def _table(drawn: Drawn, header: list[str], rows: list[list[str]]) -> None:
@@ -90,7 +90,7 @@ def in_order(drawn: Drawn) -> None:
     lines = [line((matrix.T if by_column else matrix).ravel().tolist()) for matrix in matrices]
     drawn.text(str(drawn.rng.choice(["poses.txt", "traj.log", "cam2world.txt"])), "\n".join(lines) + "\n")
     for row, stem in enumerate(drawn.names()):
-        drawn.picture(row, f"images/{stem}.jpg")
+        drawn.image(row, f"images/{stem}.jpg")
 
 
 def named(drawn: Drawn) -> None:
@@ -98,7 +98,7 @@ def named(drawn: Drawn) -> None:
     inverse = drawn.rng.random() < 0.6
     lines = []
     for row, stem in enumerate(drawn.names()):
-        drawn.picture(row, f"seq1/{stem}.jpg")
+        drawn.image(row, f"seq1/{stem}.jpg")
         numbers = drawn.matrix(row).ravel().tolist()
         if inverse and drawn.marks[row] is None:
             turn, cam_from_world = Rotation.from_matrix(drawn.poses[row, :3, :3]), np.linalg.inv(drawn.poses[row])
@@ -117,16 +117,16 @@ def beside(drawn: Drawn) -> None:
         matrix, stem = drawn.matrix(row), stem.removesuffix(".color")
         text = "\n".join(line(numbers) for numbers in matrix.tolist())
         if style == "X.npy":
-            drawn.picture(row, f"seq-01/{stem}.jpg")
+            drawn.image(row, f"seq-01/{stem}.jpg")
             np.save(drawn.folder / f"seq-01/{stem}.npy", matrix)
             continue
-        picture, pose = {
+        image_name, pose = {
             "7scenes": (f"seq-01/frame-{row:06d}.color.jpg", f"seq-01/frame-{row:06d}.pose.txt"),
             "X.txt": (f"{stem}.jpg", f"{stem}.txt"),
             "folders": (f"train/rgb/{stem}.jpg", f"train/poses/{stem}.txt"),
             "scannet": (f"color/{row}.jpg", f"pose/{row}.txt"),
         }[style]
-        drawn.picture(row, picture)
+        drawn.image(row, image_name)
         drawn.text(pose, text)
 
 
@@ -134,7 +134,7 @@ def nerfstudio(drawn: Drawn) -> None:
     """``transforms.json``, frames in any order."""
     frames = []
     for row, stem in enumerate(drawn.names()):
-        drawn.picture(row, f"images/{stem}.jpg")
+        drawn.image(row, f"images/{stem}.jpg")
         matrix = drawn.matrix(row, GL)
         matrix[3] = (0, 0, 0, 1)
         frames.append({"file_path": f"images/{stem}.jpg", "transform_matrix": matrix.tolist()})
@@ -148,7 +148,7 @@ def colmap(drawn: Drawn) -> None:
     stems, sizes = drawn.names(), sorted(set(drawn.sizes))
     images = []
     for row, stem in enumerate(stems):
-        drawn.picture(row, f"images/{stem}.jpg")
+        drawn.image(row, f"images/{stem}.jpg")
         cam_from_world = np.linalg.inv(drawn.poses[row])
         turn = np.roll(Rotation.from_matrix(cam_from_world[:3, :3]).as_quat(), 1)
         numbers = [*turn.tolist(), *cam_from_world[:3, 3].tolist()]
@@ -157,16 +157,16 @@ def colmap(drawn: Drawn) -> None:
     model = drawn.folder / str(drawn.rng.choice(["sparse", "sparse/0"]))
     if drawn.rng.random() < 0.5:
         name = model.relative_to(drawn.folder).as_posix()
-        told = [f"{number} PINHOLE {w} {h} {line(list(lens))}" for number, w, h, *lens in cameras]
-        drawn.text(f"{name}/cameras.txt", "\n".join(told) + "\n")
+        camera_lines = [f"{number} PINHOLE {w} {h} {line(list(lens))}" for number, w, h, *lens in cameras]
+        drawn.text(f"{name}/cameras.txt", "\n".join(camera_lines) + "\n")
         lines = [f"{number} {line(numbers)} {camera} {file}\n\n" for number, numbers, camera, file in images]
         drawn.text(f"{name}/images.txt", "# Image list\n" + "".join(lines))
         drawn.text(f"{name}/points3D.txt", "")
         return
     model.mkdir(parents=True)
     count = struct.Struct("<Q").pack
-    told_bytes = [struct.pack("<IiQQ4d", number, 1, w, h, *lens) for number, w, h, *lens in cameras]
-    (model / "cameras.bin").write_bytes(count(len(cameras)) + b"".join(told_bytes))
+    camera_records = [struct.pack("<IiQQ4d", number, 1, w, h, *lens) for number, w, h, *lens in cameras]
+    (model / "cameras.bin").write_bytes(count(len(cameras)) + b"".join(camera_records))
     records = [
         struct.pack("<I7dI", number, *numbers, camera) + file.encode() + b"\0" + count(0)
         for number, numbers, camera, file in images
@@ -181,29 +181,29 @@ def polycam(drawn: Drawn) -> None:
     prefix, start = str(drawn.rng.choice(["corrected_", ""])), int(drawn.rng.integers(10**8, 10**9))
     for row in range(len(drawn.poses)):
         stamp = start + 250_000 * row
-        drawn.picture(row, f"keyframes/{prefix}images/{stamp}.jpg")
+        drawn.image(row, f"keyframes/{prefix}images/{stamp}.jpg")
         width, height = drawn.sizes[row]
         fx, fy, cx, cy = _lens((width, height))
-        told = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
+        camera = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
         for name, off_m in {"cameras": 0.1 if prefix else 0.0, f"{prefix}cameras": 0.0}.items():
             matrix = drawn.matrix(row, GL)
             shifted = {f"t_{i}{j}": matrix[i, j] + off_m * (j == 3) for i in range(3) for j in range(4)}
-            drawn.text(f"keyframes/{name}/{stamp}.json", json.dumps({**told, **shifted}))
+            drawn.text(f"keyframes/{name}/{stamp}.json", json.dumps({**camera, **shifted}))
 
 
 def record3d(drawn: Drawn) -> None:
     """A recording of Record3D, of one size or with smaller images."""
     rows = []
     for row in range(len(drawn.poses)):
-        drawn.picture(row, f"rgbd/{row}.jpg")
+        drawn.image(row, f"rgbd/{row}.jpg")
         position, xyzw = drawn.seven(row)
         if drawn.marks[row] is None:
             xyzw = Rotation.from_matrix((drawn.poses[row] @ GL)[:3, :3]).as_quat().tolist()
         rows.append([*xyzw, *position])
     width, height = max(drawn.sizes)
     fx, fy, cx, cy = _lens((width, height))
-    told = {"poses": rows, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "w": width, "h": height}
-    drawn.text("metadata", json.dumps(told))
+    metadata = {"poses": rows, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "w": width, "h": height}
+    drawn.text("metadata", json.dumps(metadata))
 
 
 def _lens(size: tuple[int, int]) -> tuple[float, float, float, float]:

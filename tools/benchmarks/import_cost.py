@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 
 _HERE = Path(__file__).parents[2]
@@ -32,7 +32,7 @@ Cost = tuple[float, float, float]
 """Seconds computed, seconds passed, and the largest resident memory in MiB."""
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Print the medians of each layout and checkout, and this checkout's share of each other's."""
     parser = OptionParser(description=__doc__.splitlines()[0])
@@ -91,7 +91,7 @@ def write_nerfstudio(folder: Path, count: int) -> None:
     """Write a ``transforms.json`` with one camera."""
     width, height = _SIZE
     names = [f"images/frame_{row:06d}.jpg" for row in range(count)]
-    poses = _write_pictures(folder, names) @ _OPENGL
+    poses = _write_images(folder, names) @ _OPENGL
     camera = {"w": width, "h": height, "fl_x": 0.9 * width, "fl_y": 0.9 * width, "cx": width / 2, "cy": height / 2}
     frames = [{"file_path": name, "transform_matrix": pose.tolist()} for name, pose in zip(names, poses, strict=True)]
     (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}), encoding="utf-8")
@@ -101,14 +101,14 @@ def write_seven_scenes(folder: Path, count: int) -> None:
     """Write sequences in the layout of 7-Scenes."""
     length = -(-count // _SEQUENCES)
     stems = [f"seq-{1 + row // length:02d}/frame-{row % length:06d}" for row in range(count)]
-    for stem, pose in zip(stems, _write_pictures(folder, [f"{stem}.color.png" for stem in stems]), strict=True):
+    for stem, pose in zip(stems, _write_images(folder, [f"{stem}.color.png" for stem in stems]), strict=True):
         np.savetxt(folder / f"{stem}.pose.txt", pose, fmt="%.9f")
     for name, rests in (("TrainSplit.txt", (1, 2, 3)), ("TestSplit.txt", (0,))):
         listed = [f"sequence{number}\n" for number in range(1, _SEQUENCES + 1) if number % 4 in rests]
         (folder / name).write_text("".join(listed), encoding="utf-8")
 
 
-def _write_pictures(folder: Path, names: list[str]) -> NDArray[np.float64]:
+def _write_images(folder: Path, names: list[str]) -> NDArray[np.float64]:
     """Write an image of soft noise for each name; returns poses (N, 4, 4) of a walk in circles, camera-to-world."""
     rng, angle = np.random.default_rng(0), np.linspace(0, len(names) / 100, len(names))
     for name in names:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mambaloc import provenance
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 from mambaloc.images import Image
 from mambaloc.rendering import default_intrinsics, embedded_room, render, sensor
@@ -32,7 +32,7 @@ LENSES = {  # focal length over the training camera's, and (width, height) in pi
 }
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Localize and print."""
     parser = OptionParser(description=__doc__)

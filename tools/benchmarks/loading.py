@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mambaloc import provenance
 from mambaloc.benchmark.reference import DecodedFrames
-from mambaloc.console import OptionParser, exits_cleanly, quieten
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error
 from mambaloc.data import PoseDataModule
 from mambaloc.memory import keep_freed_memory
 
@@ -37,10 +37,10 @@ class LoadingRates:
         return median(self.cached) / median(self.decoded)
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure a scene and print."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     options = {"dataset": "embedded", "root": None, "scene": "heads", "augmentation": "crop"}
     for name, default in options.items():

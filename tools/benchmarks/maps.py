@@ -16,14 +16,14 @@ from pathlib import Path
 
 from maps_report import by_disturbance, draw, overview, read_results
 
-from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
 from mambaloc.mapping.recipe import MapRecipe, read_recipe
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure, print and write."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     names = ("robustness", "colmap", "acceptance", "report", "calibrate")

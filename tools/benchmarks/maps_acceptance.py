@@ -23,7 +23,7 @@ from mambaloc.mapping.building import MapSettings
 from mambaloc.mapping.posed import read_frames
 from mambaloc.mapping.recipe import MapRecipe
 from mambaloc.runtime.maps import CameraPose, MapLocalization, MapLocalizer
-from mambaloc.runtime.maps.acceptance import LEAST_PROBABILITY, MOST_DEVIATION, Evidence
+from mambaloc.runtime.maps.acceptance import MAX_DEVIATION, MIN_PROBABILITY, Evidence
 from mambaloc.runtime.maps.features import rescaled_intrinsics
 from mambaloc.runtime.maps.viewpoints import spread_m
 from mambaloc.runtime.rotations import matrix_from_quaternion
@@ -38,7 +38,7 @@ _FIELDS = (
 )  # fmt: skip
 _THRESHOLDS = (0.85, 0.9, 0.92, 0.95, 0.97, 0.98, 0.99)
 _BOUNDS = (0.06, 0.09, 0.12, 0.16, 0.24, np.inf)
-_MOST_WRONG = 0.005
+_MAX_WRONG = 0.005
 _NAMES = [*DISTURBANCES, _RANDOM, "focal length x 0.9", "focal length x 1.1"]
 
 Floats = NDArray[np.float64]
@@ -77,9 +77,9 @@ def _answers(
     turn = cv2.Rodrigues(np.radians(rng.normal(0, _PRIOR[1], 3)))[0]
     prior = CameraPose(turn @ truth[:3, :3], truth[:3, 3] + rng.normal(0, near_m, 3))
     found = []
-    for count, (number, picture, scale) in enumerate(_pictures(rgb, rng)):
-        matrix = rescaled_intrinsics(intrinsics, (rgb.shape[1], rgb.shape[0]), (picture.shape[1], picture.shape[0]))
-        features = localizer.features(picture, np.diag((scale, scale, 1)) @ matrix + _centered(matrix, scale))
+    for count, (number, image, scale) in enumerate(_disturbed(rgb, rng)):
+        matrix = rescaled_intrinsics(intrinsics, (rgb.shape[1], rgb.shape[0]), (image.shape[1], image.shape[0]))
+        features = localizer.features(image, np.diag((scale, scale, 1)) @ matrix + _centered(matrix, scale))
         alone = localizer.localize_features(features)
         answers = [alone] if alone.is_accepted else [alone, localizer.localize_features(features, prior)]
         distinct = {answer.evidence: answer for answer in answers if answer.evidence is not None}
@@ -94,7 +94,7 @@ def _centered(matrix: Floats, scale: float) -> Floats:
     return kept
 
 
-def _pictures(rgb: Image, rng: np.random.Generator) -> list[tuple[int, Image, float]]:
+def _disturbed(rgb: Image, rng: np.random.Generator) -> list[tuple[int, Image, float]]:
     """Number of each disturbance, the image, and by what its focal length is stated wrongly."""
     fixed = [(number, disturb(rgb, rng), 1.0) for number, disturb in enumerate(DISTURBANCES.values())]
     drawn = [(_NAMES.index(_RANDOM), _drawn(rgb, rng), 1.0) for _ in range(_DRAWN)]
@@ -119,9 +119,9 @@ def _scores(answer: MapLocalization, evidence: Evidence, truth: Floats) -> tuple
     rotation = matrix_from_quaternion(answer.quaternion)
     off = np.concatenate((truth[:3, 3] - answer.position_m, cv2.Rodrigues(truth[:3, :3] @ rotation.T)[0][:, 0]))
     chi2s = [off[:end] @ np.linalg.pinv(answer.covariance[:end, :end]) @ off[:end] for end in (6, 3)]
-    said = (evidence.cells, evidence.deviation, evidence.turn_deg, answer.inliers, answer.is_accepted)
+    scores = (evidence.cells, evidence.deviation, evidence.turn_deg, answer.inliers, answer.is_accepted)
     focal = answer.focal_scale or 0.0
-    return (*said, focal, np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:])), *chi2s)
+    return (*scores, focal, np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:])), *chi2s)
 
 
 def calibrate(folders: Sequence[Path]) -> str:
@@ -135,29 +135,33 @@ def calibrate(folders: Sequence[Path]) -> str:
     """
     of, scene = _read(folders)
     is_wrong = (of["off_m"] > FAR_M) | (of["off_deg"] > FAR_DEG)
-    says = np.isfinite(of["deviation"])
+    has_evidence = np.isfinite(of["deviation"])
     columns = zip(of["cells"], of["deviation"], of["turn_deg"], strict=True)
     evidence = [Evidence(int(cells), *others) for cells, *others in columns]
     known = np.array([each.logarithms() for each in evidence])
     is_asked = of["disturbance"] <= _NAMES.index(_RANDOM)
     group = 100 * scene + of["fold"]
-    pictures = np.column_stack((group, of["frame"], of["picture"]))
-    fit = _fit(known[says & is_asked], is_wrong[says & is_asked])
+    image_keys = np.column_stack((group, of["frame"], of["picture"]))
+    fit = _fit(known[has_evidence & is_asked], is_wrong[has_evidence & is_asked])
     lines = [
         "constant, log(cells + 0.5), log(deviation), log(turn + 0.1): " + " ".join(f"{each:.2f}" for each in fit),
-        f"{len(np.unique(pictures[:, :2], axis=0))} frames, {len(np.unique(pictures[is_asked], axis=0))} images with "
-        f"a pose, {int(is_asked.sum())} poses",
+        f"{len(np.unique(image_keys[:, :2], axis=0))} frames, {len(np.unique(image_keys[is_asked], axis=0))} images "
+        f"with a pose, {int(is_asked.sum())} poses",
     ]
     has_matches = (of["focal"] == 0) & (of["inliers"] >= MapSettings().least_inliers)
-    can = has_matches & (of["deviation"] <= MOST_DEVIATION)
-    probability = _left_out(known, is_wrong, says, is_asked, group)
-    chosen = is_asked & _likeliest(pictures, probability)
-    is_likely = has_matches & (probability >= LEAST_PROBABILITY)
-    for most in _BOUNDS:
-        lines.append(_shares(f"deviations to {most:.2f}", chosen, is_likely & (of["deviation"] <= most), is_wrong))
+    can = has_matches & (of["deviation"] <= MAX_DEVIATION)
+    probability = _left_out(known, is_wrong, has_evidence, is_asked, group)
+    chosen = is_asked & _likeliest(image_keys, probability)
+    is_likely = has_matches & (probability >= MIN_PROBABILITY)
+    for max_deviation in _BOUNDS:
+        lines.append(
+            _shares(
+                f"deviations to {max_deviation:.2f}", chosen, is_likely & (of["deviation"] <= max_deviation), is_wrong
+            )
+        )
     lines += _thresholds(chosen, np.where(can, probability, 0), is_wrong)
     probability = np.array([each.probability for each in evidence])
-    is_final, accepted = _likeliest(pictures, probability), can & (probability >= LEAST_PROBABILITY)
+    is_final, accepted = _likeliest(image_keys, probability), can & (probability >= MIN_PROBABILITY)
     rows = {"the rule as it is": is_asked}
     rows |= {folder.name: is_asked & (scene == number) for number, folder in enumerate(folders)}
     rows |= {name: of["disturbance"] == number for number, name in enumerate(_NAMES)}
@@ -169,22 +173,26 @@ def calibrate(folders: Sequence[Path]) -> str:
 
 def _thresholds(chosen: NDArray[np.bool_], probability: Floats, is_wrong: NDArray[np.bool_]) -> list[str]:
     """What each threshold accepts, and the least of those that bound the share of wrong poses."""
-    lines, least = [], None
+    lines, lowest = [], None
     for threshold in _THRESHOLDS:
         accepted = probability >= threshold
         lines.append(_shares(f"fitted to others, {threshold:.2f}", chosen, accepted, is_wrong))
-        if least is None and is_wrong[chosen & accepted].mean() <= _MOST_WRONG:
-            least = threshold
-    return [*lines, f"the least threshold with at most {_MOST_WRONG:.1%} of accepted poses wrong: {least}"]
+        if lowest is None and is_wrong[chosen & accepted].mean() <= _MAX_WRONG:
+            lowest = threshold
+    return [*lines, f"the least threshold with at most {_MAX_WRONG:.1%} of accepted poses wrong: {lowest}"]
 
 
 def _left_out(
-    known: Floats, is_wrong: NDArray[np.bool_], says: NDArray[np.bool_], is_asked: NDArray[np.bool_], group: Floats
+    known: Floats,
+    is_wrong: NDArray[np.bool_],
+    has_evidence: NDArray[np.bool_],
+    is_asked: NDArray[np.bool_],
+    group: Floats,
 ) -> Floats:
     """Probabilities by regressions on the other groups; 0 for answers without evidence."""
-    probability = np.zeros(len(says))
+    probability = np.zeros(len(has_evidence))
     for each in np.unique(group):
-        rest, left_out = says & is_asked & (group != each), says & (group == each)
+        rest, left_out = has_evidence & is_asked & (group != each), has_evidence & (group == each)
         probability[left_out] = _probability(_fit(known[rest], is_wrong[rest]), known[left_out])
     return probability
 
@@ -205,9 +213,9 @@ def _read(folders: Sequence[Path]) -> tuple[dict[str, Floats], NDArray[np.int64]
     return dict(zip(_FIELDS, np.concatenate(tables).T, strict=True)), scene
 
 
-def _likeliest(pictures: Floats, probability: Floats) -> NDArray[np.bool_]:
+def _likeliest(image_keys: Floats, probability: Floats) -> NDArray[np.bool_]:
     """Which pose of each image, a row of keys, is the answer."""
-    _, number = np.unique(pictures, axis=0, return_inverse=True)
+    _, number = np.unique(image_keys, axis=0, return_inverse=True)
     order = np.lexsort((-probability, number.ravel()))
     is_first = np.diff(number.ravel()[order], prepend=-1) > 0
     chosen = np.zeros(len(probability), bool)

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from maps_colmap import ColmapRoute, Pictures
+from maps_colmap import ColmapRoute, WrittenImages
 from maps_robustness import Answers, score
 from maps_scenes import key_and_query, timed_map
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.images import read_image
 from mambaloc.mapping.keyframes import farthest_first
 from mambaloc.mapping.recipe import MapRecipe
@@ -70,7 +70,7 @@ def measure_beside_colmap(recipe: MapRecipe, hold_out: str | None, out: Path) ->
     with TemporaryDirectory() as folder, writing(out):
         out.mkdir(parents=True, exist_ok=True)
         shown_key, shown_queries = (
-            Pictures.write(frames, recipe.settings.width, Path(folder, name))
+            WrittenImages.write(frames, recipe.settings.width, Path(folder, name))
             for name, frames in (("key", key), ("query", queries))
         )
         for seed in recipe.ransac_seeds:
@@ -93,12 +93,12 @@ def measure_beside_colmap(recipe: MapRecipe, hold_out: str | None, out: Path) ->
     }
     text = _table(result)
     for name, content in (("colmap.json", json.dumps(result, indent=2) + "\n"), ("colmap.md", text)):
-        with writing(out), whole_file(out / name) as partial:
+        with writing(out), atomic_file(out / name) as partial:
             partial.write_text(content, encoding="utf-8")
     return text
 
 
-def _ours(key: Pictures, queries: Pictures, recipe: MapRecipe, seed: int, out: Path) -> Turn:
+def _ours(key: WrittenImages, queries: WrittenImages, recipe: MapRecipe, seed: int, out: Path) -> Turn:
     settings = replace(recipe.settings, key_frames=len(key))
     sparse_map, build_cpu_s = timed_map(key.frames, replace(recipe, settings=settings))
     sparse_map.save(out / MAP_FILE)
@@ -110,7 +110,7 @@ def _ours(key: Pictures, queries: Pictures, recipe: MapRecipe, seed: int, out: P
     return Turn(scores, build_cpu_s, (out / MAP_FILE).stat().st_size, len(sparse_map))
 
 
-def _theirs(key: Pictures, queries: Pictures, work: Path, seed: int) -> Turn:
+def _theirs(key: WrittenImages, queries: WrittenImages, work: Path, seed: int) -> Turn:
     """In a process of its own, which a crash ends."""
     route, start = ColmapRoute(key, work, seed), time.process_time()
     route.build()

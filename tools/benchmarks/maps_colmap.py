@@ -29,7 +29,7 @@ _WORDS = 32  # of the codebook
 
 
 @dataclass(frozen=True)
-class Pictures:
+class WrittenImages:
     """Frames of one camera as files of one size.
 
     Shape:
@@ -43,7 +43,7 @@ class Pictures:
     world_from_cam: NDArray[np.float64]
 
     @classmethod
-    def write(cls, frames: PosedFrames, width: int, folder: Path) -> Pictures:
+    def write(cls, frames: PosedFrames, width: int, folder: Path) -> WrittenImages:
         """Write frames as PNG of a width."""
         folder.mkdir(parents=True)
         names = [f"{folder.name}_{number:05d}.png" for number in range(len(frames))]
@@ -74,7 +74,7 @@ class ColmapRoute:
         seed: of every RANSAC.
     """
 
-    key: Pictures
+    key: WrittenImages
     work: Path
     seed: int = 0
 
@@ -99,7 +99,7 @@ class ColmapRoute:
         params = (focal_x, focal_y, *center)
         return self.colmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
 
-    def find_features(self, pictures: Pictures) -> None:
+    def find_features(self, images: WrittenImages) -> None:
         """Find SIFT of images, with COLMAP's defaults, on one thread."""
         colmap, mode = self.colmap, self.colmap.CameraMode.SINGLE
         reader = colmap.ImageReaderOptions(camera_model="PINHOLE")
@@ -107,7 +107,7 @@ class ColmapRoute:
         with colmap.Database.open(self.database):  # which makes it
             pass
         options = colmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
-        colmap.extract_features(self.database, pictures.folder, pictures.names, mode, reader, options)
+        colmap.extract_features(self.database, images.folder, images.names, mode, reader, options)
 
     def match(self, pairs: Sequence[tuple[str, str]], is_verified: bool) -> None:
         """Match pairs of images."""
@@ -153,7 +153,7 @@ class ColmapRoute:
         model = sum(path.stat().st_size for path in (self.work / "model").iterdir())
         return model + descriptors + 2 * (self.words.size + self.index.size)
 
-    def localize(self, queries: Pictures) -> list[Floats | None]:
+    def localize(self, queries: WrittenImages) -> list[Floats | None]:
         """Localize queries, all of each step together: ``world_from_cam`` (4, 4), or None, of each."""
         self.find_features(queries)
         with self.colmap.Database.open(self.database) as database:

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from mambaloc import provenance
 from mambaloc.errors import InputError
 from mambaloc.evaluation.intervals import block_resamples
-from mambaloc.files import read_json, whole_file, writing
+from mambaloc.files import atomic_file, read_json, writing
 from mambaloc.viz.curves import COLORS, finish
 from mambaloc.viz.trajectory import write_png
 
@@ -80,7 +80,7 @@ def write_result(result: Mapping[str, Any], found: Mapping[str, Mapping[str, Ans
             (RESULT_FILE, json.dumps(_finite(result), indent=2) + "\n"),
             ("robustness.md", table(result)),
         ):
-            with whole_file(folder / name) as partial:
+            with atomic_file(folder / name) as partial:
                 partial.write_text(text, encoding="utf-8")
         save_answers(found, folder / "answers.npz")
 

@@ -103,10 +103,10 @@ def measure(
         shots = list(zip(frames.images, frames.intrinsics, frames.world_from_cam, strict=True))
         for row, (image, intrinsics, truth) in enumerate(progress(shots, f"{name:24}", len(shots))):
             rgb = read_image(image) if isinstance(image, Path) else image
-            picture = disturb(rgb, np.random.default_rng((number, row)))
-            sizes = ((each.shape[1], each.shape[0]) for each in (rgb, picture))
+            image = disturb(rgb, np.random.default_rng((number, row)))
+            sizes = ((each.shape[1], each.shape[0]) for each in (rgb, image))
             matrix = rescaled_intrinsics(intrinsics, *sizes)
-            for way, answers in _localize(localizers, network, picture, matrix).items():
+            for way, answers in _localize(localizers, network, image, matrix).items():
                 scores = [score(answer, is_accepted, cpu_s, truth) for answer, is_accepted, cpu_s in answers]
                 rows.setdefault(way, []).append(np.array(scores))
         found[name] = {way: Answers.of(np.stack(each, axis=1)) for way, each in rows.items()}
@@ -114,20 +114,20 @@ def measure(
 
 
 def _localize(
-    localizers: Sequence[MapLocalizer], network: Localizer | None, picture: Any, intrinsics: Floats
+    localizers: Sequence[MapLocalizer], network: Localizer | None, image: Any, intrinsics: Floats
 ) -> dict[str, list[tuple[Found, bool, float]]]:
     """Each way's answers, whether they are accepted, and what they took; an answer a seed, of a network one."""
     found: dict[str, list[tuple[Found, bool, float]]] = {}
     guess, network_s, prior = None, 0.0, None
     if network:
-        guess, network_s = _timed(network.localize, picture)
+        guess, network_s = _timed(network.localize, image)
         prior = CameraPose.from_quaternion(guess.quaternion, guess.position_m)
         found["network"] = [(guess, False, network_s)]
     for localizer in localizers:
-        alone, alone_s = _timed(localizer.localize, picture, intrinsics)
+        alone, alone_s = _timed(localizer.localize, image, intrinsics)
         found.setdefault("map", []).append((alone, alone.is_accepted, alone_s))
         if guess:
-            guided, guided_s = _timed(localizer.localize, picture, intrinsics, prior)
+            guided, guided_s = _timed(localizer.localize, image, intrinsics, prior)
             both = combined(guess, guided)
             found.setdefault("both", []).append((both, both.is_accepted, network_s + guided_s))
     return found

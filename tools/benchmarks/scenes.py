@@ -17,7 +17,7 @@ from rich.progress import track
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process, peak_bytes
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
 from mambaloc.data import PoseDataModule
 from mambaloc.data.datasets.registry import DATASETS, scene_folder
 from mambaloc.data.frames import BadFrames, Split
@@ -63,10 +63,10 @@ class SceneCost:
         return self.listed["train"], self.listed["test"]
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure scenes and print."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument("root", type=Path, help="folder that holds them")
     parser.add_argument("scenes", nargs="*", help="names; every official one that is there unless given")
@@ -114,14 +114,14 @@ def print_scenes(scenes: Sequence[SceneCost], machine: str) -> None:
         table.add_row(each.scene, f"{train} + {test}", *seconds, memory, disk)
     console = Console(highlight=False)
     console.print(table)
-    for said, which in {
+    for label, which in {
         "of the benchmark's size": [each.scene for each in scenes if each.counts == each.official],
         "of another size than the benchmark's": [each.scene for each in scenes if each.counts != each.official],
         "rendered, no real images": [each.scene for each in scenes if each.rendered],
         "with bad frames": [f"{each.scene} ({each.skipped})" for each in scenes if each.skipped],
     }.items():
         if which:
-            console.print(f"{said}: {', '.join(which)}", soft_wrap=True)
+            console.print(f"{label}: {', '.join(which)}", soft_wrap=True)
     console.print("decode: once, ever; open: from the cache, each run. Memory: the most while loading, the")
     console.print("cache's mapped pages included, less that of the process before it.")
     console.print(machine, soft_wrap=True)
@@ -147,13 +147,13 @@ def _measure(dataset: str, root: Path, scene: str, short_side: int, cache: str) 
     read_s = time.perf_counter() - start
     _, build_s = load()
     data, open_s = load()
-    told = data.describe()
+    description = data.describe()
     return SceneCost(
         scene,
-        told["listed_frames"],
+        description["listed_frames"],
         DATASETS[dataset].official_counts.get(scene),
-        told["rendered"],
-        sum(sum(counts.values()) for counts in told["skipped"].values()),
+        description["rendered"],
+        sum(sum(counts.values()) for counts in description["skipped"].values()),
         read_s,
         build_s - read_s,
         open_s,

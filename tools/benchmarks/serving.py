@@ -27,8 +27,8 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc import provenance
-from mambaloc.benchmark.footprint import said_of
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.benchmark.footprint import proc_value
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 from mambaloc.images import decode_image
 from mambaloc.runtime import Localizer
@@ -55,7 +55,7 @@ class Load:
     status: Counter[int]
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure and print."""
     parser = OptionParser(description=__doc__)
@@ -83,15 +83,15 @@ def main() -> None:
         print(f"memory of server and workers, in turn: {', '.join(f'{each:.0f}' for each in memory_mib)} MiB")
 
 
-def loop_per_second(bundle: Path, picture: Path, threads: int | None) -> float:
+def loop_per_second(bundle: Path, path: Path, threads: int | None) -> float:
     """Images that a loop decodes and localizes in a second."""
-    localizer, data = Localizer(bundle, threads), picture.read_bytes()
+    localizer, data = Localizer(bundle, threads), path.read_bytes()
     counts: list[float] = []
     began = time.perf_counter()
     while time.perf_counter() - began < _SECONDS / 2:
         image = decode_image(data)
         if isinstance(image, str):
-            raise InputError(f"{picture}: {image}. Give another.")
+            raise InputError(f"{path}: {image}. Give another.")
         localizer.localize(image)
         counts.append(time.perf_counter())
     half = counts[len(counts) // 5 :]  # once everything is warm
@@ -123,10 +123,10 @@ def _is_up(url: str) -> bool:
         return False
 
 
-def under_load(url: str, picture: Path, clients: int, seconds: float = 0, requests: int = 0) -> Load:
+def under_load(url: str, image: Path, clients: int, seconds: float = 0, requests: int = 0) -> Load:
     """Send an image again and again, for so long or so often."""
     amount = ["-n", str(requests // clients * clients)] if requests else ["-z", f"{seconds}s"]
-    command = ["hey", *amount, "-c", str(clients), "-m", "POST", "-D", str(picture), "-t", "60", "-o", "csv", url]
+    command = ["hey", *amount, "-c", str(clients), "-m", "POST", "-D", str(image), "-t", "60", "-o", "csv", url]
     began = time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     took_s = time.perf_counter() - began
@@ -173,7 +173,7 @@ def workers_of(server: int) -> list[int]:
 def resident_mib(process: int) -> float:
     """Resident memory of a process, in MiB; 0 of one that has ended."""
     try:
-        return said_of(Path(f"/proc/{process}/status"), "VmRSS:") / 1024
+        return proc_value(Path(f"/proc/{process}/status"), "VmRSS:") / 1024
     except OSError:
         return 0.0
 

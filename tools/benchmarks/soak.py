@@ -21,9 +21,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from mambaloc import provenance
-from mambaloc.benchmark.footprint import STATUS, said_of
+from mambaloc.benchmark.footprint import STATUS, proc_value
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
 from mambaloc.files import writing
 from mambaloc.viz.curves import COLORS, finish
@@ -63,10 +63,10 @@ class Sample:
     threads: int
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Train, print and draw."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument("recipes", type=Path, nargs="+", help="a recipe, and overlays")
     parser.add_argument("--steps", type=whole_number(1), default=10_000)
@@ -99,10 +99,10 @@ class ResourceWatch(L.Callback):
         sample = Sample(
             trainer.global_step,
             round(time.monotonic() - self._started_at, 3),
-            said_of(STATUS, "RssAnon:") / 1024,
+            proc_value(STATUS, "RssAnon:") / 1024,
             device / 2**20,
             len(list(STATUS.with_name("fd").iterdir())),
-            said_of(STATUS, "Threads:"),
+            proc_value(STATUS, "Threads:"),
         )
         with self.out.open("a", encoding="utf-8") as file:
             file.write(json.dumps(asdict(sample)) + "\n")
@@ -137,8 +137,8 @@ def measure_soak(recipes: Sequence[Path], steps: int, out: Path) -> list[Sample]
         *(f"{watch}+=soak.ResourceWatch", f"{watch}.out={samples}"),
         f"{watch}.every_n_steps={max(1, steps // _SAMPLES)}",
     ]
-    with Console(stderr=True).status(f"training {steps} steps"), log.open("w", encoding="utf-8") as said:
-        ended = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, check=False)
+    with Console(stderr=True).status(f"training {steps} steps"), log.open("w", encoding="utf-8") as output:
+        ended = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, check=False)
     if ended.returncode:
         last = (log.read_text(encoding="utf-8").strip().splitlines() or ["it printed nothing"])[-1]
         raise InputError(f"{recipes[0]}: its training ended with {ended.returncode} ({last}); see {log}")

@@ -20,7 +20,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mambaloc.console import OptionParser, exits_cleanly, whole_number
+from mambaloc.console import OptionParser, exit_on_input_error, whole_number
 from mambaloc.importing.frame_choice import choose_frames
 from mambaloc.importing.importer import import_scene
 from mambaloc.importing.sfm.process import Job
@@ -37,7 +37,7 @@ _NEIGHBOURS = 10  # of a video's frame that it is matched with, as the import ha
 _INSIDE_M = ((-1.25, -1.0, 1.1), (1.25, 1.0, 1.7))
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Print CPU seconds of each step, and the errors of both mappers."""
     parser = OptionParser(description=__doc__.splitlines()[0])
@@ -51,10 +51,10 @@ def main() -> None:
 
 
 def _measure(seed: int, count: int, work: Path) -> None:
-    film, world_from_cam = _film(seed, count, work)
+    video, world_from_cam = _video(seed, count, work)
     images, database = work / "images", work / "database.db"
     images.mkdir()
-    chosen, taken_s = _timed(lambda: write_frames(choose_frames(frames_of(film)[0]), images))
+    chosen, taken_s = _timed(lambda: write_frames(choose_frames(frames_of(video)[0]), images))
     names = sorted(chosen[0])
     print(f"film {seed}: {len(names)} of {count} frames chosen, {taken_s:.2f} s")
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
@@ -68,12 +68,12 @@ def _measure(seed: int, count: int, work: Path) -> None:
         shutil.copy(database, own / "database.db")
         model, taken_s = _timed(partial(mapper, own / "database.db", images, own))
         print(f"  {mapper.__name__[1:]}: {taken_s:.2f} s; {_describe(model, world_from_cam)}")
-    _, taken_s = _timed(lambda: read_structure(film, threads=1))
+    _, taken_s = _timed(lambda: read_structure(video, threads=1))
     print(f"  all of it, as imported: {taken_s:.2f} s")
-    print(f"  the rest of the import: {_timed(lambda: import_scene(film, work / 'scene'))[1]:.2f} s", flush=True)
+    print(f"  the rest of the import: {_timed(lambda: import_scene(video, work / 'scene'))[1]:.2f} s", flush=True)
 
 
-def _film(seed: int, count: int, folder: Path) -> tuple[Path, Floats]:
+def _video(seed: int, count: int, folder: Path) -> tuple[Path, Floats]:
     world_from_cam = smooth_trajectory(count, seed=seed, inside_m=_INSIDE_M, step_deg=1.5)
     room = furnished_room(_INSIDE_M, seed=0, px_per_m=140)
     path = folder / "room.avi"
@@ -111,11 +111,11 @@ def _describe(model: Any, world_from_cam: Floats) -> str:
     true = world_from_cam[[int(Path(image.name).stem) for image in placed]]
     found = [image.cam_from_world().inverse() for image in placed]
     centers = np.array([pose.translation for pose in found])
-    apart, true_apart = centers - centers.mean(axis=0), true[:, :3, 3] - true[:, :3, 3].mean(axis=0)
-    rotation, _ = Rotation.align_vectors(true_apart, apart)
-    turned = rotation.apply(apart)
-    scale = (turned * true_apart).sum() / (turned**2).sum()
-    error_mm = 1000 * np.linalg.norm(scale * turned - true_apart, axis=1)
+    centered, true_centered = centers - centers.mean(axis=0), true[:, :3, 3] - true[:, :3, 3].mean(axis=0)
+    rotation, _ = Rotation.align_vectors(true_centered, centered)
+    turned = rotation.apply(centered)
+    scale = (turned * true_centered).sum() / (turned**2).sum()
+    error_mm = 1000 * np.linalg.norm(scale * turned - true_centered, axis=1)
     orientation = rotation * Rotation.from_quat(np.array([pose.rotation.quat for pose in found]))
     error_deg = np.degrees((orientation.inv() * Rotation.from_matrix(true[:, :3, :3])).magnitude())
     return (

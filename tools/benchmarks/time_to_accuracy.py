@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from maps_beside import errors_of_pose
-from maps_colmap import ColmapRoute, Pictures
+from maps_colmap import ColmapRoute, WrittenImages
 from maps_scenes import key_and_query
 from rich.console import Console
 from rich.table import Table
@@ -28,9 +28,9 @@ from rich.table import Table
 from mambaloc import provenance
 from mambaloc.benchmark.footprint import in_a_process
 from mambaloc.benchmark.report import new_table
-from mambaloc.console import OptionParser, exits_cleanly, quieten, whole_number
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
 from mambaloc.errors import InputError
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.mapping.building import build_map
 from mambaloc.mapping.evaluating import measure
 from mambaloc.mapping.keyframes import farthest_first
@@ -79,10 +79,10 @@ class Way:
 REACH = (Errors(0.2, 6), Errors(0.19, 6.3), Errors(0.1, 3), Errors(0.05, 2))
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure each way, print the table, and write every figure to ``time_to_accuracy.json``."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("sweep", type=Path, help="of trainings, as recipes/sweeps/ holds them")
     parser.add_argument("--map", type=Path, help="recipe of a map, to measure beside pycolmap's route")
@@ -98,7 +98,7 @@ def main() -> None:
         raise InputError(f"--{'frames' if args.frames else 'width'}: is of a map. Give its recipe with --map.")
     if recipe:
         recipe = replace(recipe, settings=replace(recipe.settings, **given))
-    with whole_folder(args.out, "choose another folder with --out") as folder:
+    with atomic_folder(args.out, "choose another folder with --out") as folder:
         ways = [measure_training(trial, folder, sweep.time_limit_s, sweep.cpus) for trial in sweep.trials]
         if recipe:
             ways += measure_maps(recipe)
@@ -173,11 +173,11 @@ def _map(recipe: MapRecipe, started: float) -> tuple[float, tuple[tuple[float, E
 def _colmap(recipe: MapRecipe, work: Path, started: float) -> tuple[float, tuple[tuple[float, Errors], ...]]:
     train, queries = key_and_query(recipe, None)
     key = train.select(farthest_first(train.world_from_cam, recipe.settings.key_frames))
-    route = ColmapRoute(Pictures.write(key, recipe.settings.width, work / "key"), work / "route")
+    route = ColmapRoute(WrittenImages.write(key, recipe.settings.width, work / "key"), work / "route")
     route.work.mkdir()
     route.build()
     built_s = time.time() - started
-    shown = Pictures.write(queries, recipe.settings.width, work / "query")
+    shown = WrittenImages.write(queries, recipe.settings.width, work / "query")
     scores = [
         errors_of_pose(pose, truth) for pose, truth in zip(route.localize(shown), shown.world_from_cam, strict=True)
     ]

@@ -9,14 +9,14 @@ from uncertainty_methods import measure_certainty
 from uncertainty_report import print_certainty, write_certainty
 
 from mambaloc import provenance
-from mambaloc.console import OptionParser, exits_cleanly, quieten
+from mambaloc.console import OptionParser, configure_logging, exit_on_input_error
 from mambaloc.zoo.bundles import load_with_scene
 
 
-@exits_cleanly
+@exit_on_input_error
 def main() -> None:
     """Measure, print and write."""
-    quieten()
+    configure_logging()
     parser = OptionParser(description=__doc__)
     parser.add_argument("checkpoints", nargs="+", help="of one scene; several are also taken for an ensemble")
     parser.add_argument("--elsewhere", type=Path, help="folder of images of another place")

@@ -45,7 +45,7 @@ _ByLevel = dict[float, tuple[float, float]]
 Frames = tuple[Tensor, Tensor | None]
 """Decoded frames, (B, 3, H, W) ``uint8``, larger than the network's crop, and their intrinsics, (B, 3, 3), if known."""
 
-Pictures = Callable[[], Iterator[Frames]]
+FrameSource = Callable[[], Iterator[Frames]]
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def measure_certainty(
             head, held_out = head_and_held_out(system, data)
             data.setup("test")
             test = errors_by_distance(network, head, data, "test")
-            there = _no_pictures if elsewhere is None else _pictures_of(elsewhere, data)
+            there = _no_frames if elsewhere is None else _frames_of(elsewhere, data)
             coverage, radii = _covered(head, held_out, test)
             far = _distances(network, head, data.crop, there)
             by_spread = _by_spread(network, networks, data.crop, _test_frames(data), there)
@@ -177,21 +177,21 @@ def ood_auroc(score: Tensor, elsewhere: Tensor) -> float:
 
 
 def _by_spread(
-    network: PoseNetwork, networks: list[PoseNetwork], size: tuple[int, int], test: Pictures, there: Pictures
+    network: PoseNetwork, networks: list[PoseNetwork], size: tuple[int, int], test: FrameSource, there: FrameSource
 ) -> list[UncertaintyMethod]:
     """Ways that localize an image several times, and take how far apart the poses are."""
-    told: dict[str, tuple[int, Callable[[Frames], list[PosePrediction]]]] = {
+    methods: dict[str, tuple[int, Callable[[Frames], list[PosePrediction]]]] = {
         "dropout": (PASSES, lambda frames: _dropped_out(network, frames, size)),
         "shifted crops": (5, lambda frames: [_localized(network, frames, size, place) for place in _PLACES]),
     }
     if len(networks) > 1:
-        told[f"ensemble of {len(networks)}"] = (
+        methods[f"ensemble of {len(networks)}"] = (
             len(networks),
             lambda frames: [_localized(each, frames, size) for each in networks],
         )
     ways = [
         UncertaintyMethod(name, passes, *_spreads(poses, test), _spreads(poses, there)[0])
-        for name, (passes, poses) in told.items()
+        for name, (passes, poses) in methods.items()
     ]
     if not network.takes_intrinsics:
         return ways
@@ -210,25 +210,25 @@ def _localized(
 
 
 @torch.inference_mode()
-def _disagreement(network: PoseNetwork, size: tuple[int, int], pictures: Pictures) -> tuple[Tensor, Tensor]:
+def _disagreement(network: PoseNetwork, size: tuple[int, int], source: FrameSource) -> tuple[Tensor, Tensor]:
     """How far a dense head's cells are from the pose that they are solved for, in metres and degrees; (N,) each."""
     position, rotation = [torch.zeros(0)], [torch.zeros(0)]
-    for frames in pictures():
+    for frames in source():
         prediction = _localized(network, frames, size)
         if (cells := prediction.cells) is None:
             return position[0], rotation[0]
-        apart_m = position_error_m(cells.position_m, prediction.position_m[:, None])
-        position.append((apart_m * cells.position_weights).sum(dim=1))
+        distance_m = position_error_m(cells.position_m, prediction.position_m[:, None])
+        position.append((distance_m * cells.position_weights).sum(dim=1))
         if cells.rays_world is not None:
             turned = rotate(prediction.quaternion[:, None], cells.rays_cam)
-            apart_deg = torch.rad2deg(2 * torch.asin((cells.rays_world - turned).norm(dim=-1) / 2))
-            rotation.append((apart_deg * cells.rotation_weights).sum(dim=1))
+            angle_deg = torch.rad2deg(2 * torch.asin((cells.rays_world - turned).norm(dim=-1) / 2))
+            rotation.append((angle_deg * cells.rotation_weights).sum(dim=1))
     return torch.cat(position), torch.cat(rotation)
 
 
 @torch.inference_mode()
-def _spreads(poses: Callable[[Frames], list[PosePrediction]], pictures: Pictures) -> tuple[Tensor, Tensor]:
-    spreads = [pose_spread(poses(frames)) for frames in pictures()]
+def _spreads(poses: Callable[[Frames], list[PosePrediction]], source: FrameSource) -> tuple[Tensor, Tensor]:
+    spreads = [pose_spread(poses(frames)) for frames in source()]
     none = torch.zeros(0)
     positions, rotations = zip((none, none), *spreads, strict=True)
     return torch.cat(positions), torch.cat(rotations)
@@ -240,9 +240,9 @@ def pose_spread(poses: list[PosePrediction]) -> tuple[Tensor, Tensor]:
     quaternions_KB4 = torch.stack([canonical(each.quaternion) for each in poses])
     sign_KB1 = torch.where((quaternions_KB4 * quaternions_KB4[:1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
     mean_m, mean_q = positions_KB3.mean(0), canonical((sign_KB1 * quaternions_KB4).mean(0))
-    apart_m = position_error_m(positions_KB3, mean_m.expand_as(positions_KB3))
-    apart_deg = rotation_error_deg(quaternions_KB4, mean_q.expand_as(quaternions_KB4))
-    return apart_m.square().mean(0).sqrt(), apart_deg.square().mean(0).sqrt()
+    distance_m = position_error_m(positions_KB3, mean_m.expand_as(positions_KB3))
+    angle_deg = rotation_error_deg(quaternions_KB4, mean_q.expand_as(quaternions_KB4))
+    return distance_m.square().mean(0).sqrt(), angle_deg.square().mean(0).sqrt()
 
 
 def _dropped_out(network: PoseNetwork, frames: Frames, size: tuple[int, int]) -> list[PosePrediction]:
@@ -259,20 +259,20 @@ def _dropped_out(network: PoseNetwork, frames: Frames, size: tuple[int, int]) ->
 
 
 @torch.inference_mode()
-def _distances(network: PoseNetwork, head: UncertaintyHead, size: tuple[int, int], pictures: Pictures) -> Tensor:
-    distances = [head.distance(pooled(network.backbone(center_crop(image, size)))) for image, _ in pictures()]
+def _distances(network: PoseNetwork, head: UncertaintyHead, size: tuple[int, int], source: FrameSource) -> Tensor:
+    distances = [head.distance(pooled(network.backbone(center_crop(image, size)))) for image, _ in source()]
     return torch.cat([torch.zeros(0), *distances])
 
 
-def _no_pictures() -> Iterator[Frames]:
+def _no_frames() -> Iterator[Frames]:
     return iter(())
 
 
-def _test_frames(data: PoseDataModule) -> Pictures:
+def _test_frames(data: PoseDataModule) -> FrameSource:
     return lambda: ((batch.image, batch.intrinsics) for batch in data.test_dataloader())
 
 
-def _pictures_of(folder: Path, data: PoseDataModule) -> Pictures:
+def _frames_of(folder: Path, data: PoseDataModule) -> FrameSource:
     """Images of another place, their middle cut to the shape of the scene's frames."""
     paths = list_images(folder)
     if not paths:

@@ -25,7 +25,7 @@ from uncertainty_methods import (
 )
 
 from mambaloc.benchmark.report import new_table
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.viz.curves import COLORS, finish
 from mambaloc.viz.png import write_png
 
@@ -41,8 +41,8 @@ def print_certainty(found: Sequence[UncertaintyReport], machine: str) -> None:
     for name, figures in compared(found).items():
         ranks = (f"{figures[f'{of}_rank_correlation']:.2f}" for of in _ERRORS)
         changes = (f"{figures[f'{of}_change']:+.1%}" for of in _ERRORS)
-        apart = "" if figures["told_apart"] is None else f"{figures['told_apart']:.3f}"
-        table.add_row(name, str(figures["passes"]), *ranks, *changes, apart)
+        auroc = "" if figures["told_apart"] is None else f"{figures['told_apart']:.3f}"
+        table.add_row(name, str(figures["passes"]), *ranks, *changes, auroc)
     console.print(table)
     explained = "rank: correlation of scores' ranks with errors'"
     rejected = f"median: what leaving out the {REJECTED:.0%} least sure frames changes it by"
@@ -55,9 +55,9 @@ def print_certainty(found: Sequence[UncertaintyReport], machine: str) -> None:
     console.print(table)
     first = found[0]
     flagged = f"unfamiliar: {np.mean([_flagged(each.unfamiliarity) for each in found]):.1%} of the test frames"
-    if pictures := len(first.unfamiliarity_elsewhere):
+    if images_elsewhere := len(first.unfamiliarity_elsewhere):
         there = np.mean([_flagged(each.unfamiliarity_elsewhere) for each in found])
-        flagged += f", {there:.1%} of {pictures} images of another place"
+        flagged += f", {there:.1%} of {images_elsewhere} images of another place"
     console.print(flagged, soft_wrap=True)
     counts = f"{len(first.position_error_m)} test frames, {first.held_out_frames} held out of training to calibrate on"
     console.print(f"{found[0].where}; {counts}; means over {len(found)} checkpoint(s); {machine}", soft_wrap=True)
@@ -85,7 +85,7 @@ def write_certainty(found: Sequence[UncertaintyReport], folder: Path, machine: s
     Raises:
         InputError: where it cannot be written.
     """
-    told = {
+    content = {
         "where": found[0].where,
         "machine": machine,
         "compared": compared(found),
@@ -104,8 +104,8 @@ def write_certainty(found: Sequence[UncertaintyReport], folder: Path, machine: s
     }
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(folder / "uncertainty.json") as partial:
-            partial.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+        with atomic_file(folder / "uncertainty.json") as partial:
+            partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         _draw(found, folder / "uncertainty.png")
 
 

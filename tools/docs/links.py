@@ -3,7 +3,7 @@
 import posixpath
 import re
 
-_PICTURES = (".jpg", ".png")
+_IMAGE_SUFFIXES = (".jpg", ".png")
 _LINK = re.compile(r"(\]\()(\.\./[^)#\s]+)")
 
 
@@ -13,6 +13,6 @@ def on_page_markdown(markdown, page, config, files):
 
     def absolute(match: re.Match[str]) -> str:
         path = posixpath.normpath(posixpath.join("docs", posixpath.dirname(page.file.src_uri), match[2]))
-        return f"{match[1]}{repository}/{'raw' if path.endswith(_PICTURES) else 'blob'}/main/{path}"
+        return f"{match[1]}{repository}/{'raw' if path.endswith(_IMAGE_SUFFIXES) else 'blob'}/main/{path}"
 
     return _LINK.sub(absolute, markdown)

@@ -32,7 +32,7 @@ WORLD_KEY = "world"
 COLUMNS = ("image", "sequence", "time_s", "x", "y", "z", "qw", "qx", "qy", "qz", "camera", "split")
 SPLITS = ("train", "val", "test", "unused")
 
-MOST_FRAMES = 200_000
+MAX_FRAMES = 200_000
 _MEND = "import the scene again"
 
 
@@ -95,12 +95,12 @@ def read_scene(folder: Path) -> dict[str, Any]:
         InputError: if it is not an imported scene, or of another version.
     """
     path = folder / SCENE_FILE
-    told = read_json(path, _MEND, _MEND)
-    if not isinstance(told, dict) or VERSION_KEY not in told:
+    scene = read_json(path, _MEND, _MEND)
+    if not isinstance(scene, dict) or VERSION_KEY not in scene:
         raise InputError(f"{path}: is not of an imported scene; make one with mambaloc import")
-    if told[VERSION_KEY] != VERSION:
-        raise InputError(f"{path}: has version {str(told[VERSION_KEY])[:20]}, but {VERSION} is expected; {_MEND}")
-    return told
+    if scene[VERSION_KEY] != VERSION:
+        raise InputError(f"{path}: has version {str(scene[VERSION_KEY])[:20]}, but {VERSION} is expected; {_MEND}")
+    return scene
 
 
 def read_rows(folder: Path) -> list[Row]:
@@ -112,14 +112,14 @@ def read_rows(folder: Path) -> list[Row]:
     path = folder / FRAMES_FILE
     rows: list[Row] = []
     lines: dict[Path, int] = {}
-    for line, told in _table(path):
-        row = _row(folder, told, f"{path}, line {line}")
+    for line, fields in _table(path):
+        row = _row(folder, fields, f"{path}, line {line}")
         if row.image in lines:
-            raise InputError(f"{path}, line {line}: {told['image']} is on line {lines[row.image]}, too; remove one")
+            raise InputError(f"{path}, line {line}: {fields['image']} is on line {lines[row.image]}, too; remove one")
         lines[row.image] = line
         rows.append(row)
-        if len(rows) > MOST_FRAMES:
-            raise InputError(f"{path}: has more than {MOST_FRAMES} rows; keep fewer")
+        if len(rows) > MAX_FRAMES:
+            raise InputError(f"{path}: has more than {MAX_FRAMES} rows; keep fewer")
     if not rows:
         raise InputError(f"{path}: has no row; {_MEND}")
     return rows
@@ -140,10 +140,10 @@ def world_of(folder: Path) -> World:
 def describe_capture(folder: Path) -> dict[str, Any]:
     """What a result must state of an imported scene: its unit, its source, its world,
     how it was split."""
-    told = read_scene(folder)
-    imported, split = (value if isinstance(value := told.get(key), dict) else {} for key in ("imported", "split"))
+    scene = read_scene(folder)
+    imported, split = (value if isinstance(value := scene.get(key), dict) else {} for key in ("imported", "split"))
     return {
-        "unit": told.get("unit"),
+        "unit": scene.get("unit"),
         "format": imported.get("format"),
         "split_by": split.get("chosen"),
         "world": asdict(world_of(folder)),
@@ -177,17 +177,17 @@ def _table(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
         raise InputError(f"{path}: is not CSV ({error}); {_MEND}") from None
 
 
-def _row(folder: Path, told: dict[str, str], where: str) -> Row:
-    image = path_inside(folder, told["image"])
+def _row(folder: Path, fields: dict[str, str], where: str) -> Row:
+    image = path_inside(folder, fields["image"])
     if image is None:
-        raise InputError(f"{where}: image {told['image'][:80]!r} is not a path inside the folder; correct the row")
-    if told["split"] not in SPLITS:
-        raise InputError(f"{where}: split {told['split'][:20]!r} is not one of {', '.join(SPLITS)}; correct the row")
-    if not told["sequence"]:
+        raise InputError(f"{where}: image {fields['image'][:80]!r} is not a path inside the folder; correct the row")
+    if fields["split"] not in SPLITS:
+        raise InputError(f"{where}: split {fields['split'][:20]!r} is not one of {', '.join(SPLITS)}; correct the row")
+    if not fields["sequence"]:
         raise InputError(f"{where}: names no sequence; correct the row")
-    numbers = ("x", "y", "z", "qw", "qx", "qy", "qz", *(["time_s"] if told["time_s"] else []))
+    numbers = ("x", "y", "z", "qw", "qx", "qy", "qz", *(["time_s"] if fields["time_s"] else []))
     try:
-        values = {name: float(told[name]) for name in numbers}
+        values = {name: float(fields[name]) for name in numbers}
     except ValueError:
         raise InputError(f"{where}: {', '.join(numbers)} are not all numbers; correct the row") from None
     if not all(math.isfinite(value) for value in values.values()):
@@ -197,7 +197,7 @@ def _row(folder: Path, told: dict[str, str], where: str) -> Row:
         raise InputError(f"{where}: lies farther than {FARTHEST:g} from the origin; shift the world towards it")
     if abs(math.hypot(*pose[3:]) - 1) > UNIT_TOLERANCE:
         raise InputError(f"{where}: quaternion has length {math.hypot(*pose[3:]):.6g}, not 1; correct the row")
-    return Row(image, told["sequence"], pose, told["camera"], told["split"], values.get("time_s"))
+    return Row(image, fields["sequence"], pose, fields["camera"], fields["split"], values.get("time_s"))
 
 
 DATASET = Dataset(CAPTURE, read_split, {}, Path("scenes"), marks_validation=True)

@@ -29,7 +29,7 @@ from mambaloc.errors import InputError
 from mambaloc.files import sha256
 
 _UNPACKED_PER_BYTE = 1.2  # images hardly compress; the margin holds one inner zip
-_MOST_UNPACKED_PER_BYTE = 10
+_MAX_UNPACKED_PER_BYTE = 10
 _SMALL_BYTES = 64 << 20
 
 
@@ -168,7 +168,7 @@ def _install(source: Source, archive: Path, target: Path) -> None:
     shutil.rmtree(unpacking, ignore_errors=True)  # what a killed run left
     unpacking.mkdir()
     try:
-        limit_bytes = max(archive.stat().st_size * _MOST_UNPACKED_PER_BYTE, _SMALL_BYTES)
+        limit_bytes = max(archive.stat().st_size * _MAX_UNPACKED_PER_BYTE, _SMALL_BYTES)
         with _bar(f"unpacking {archive.name}") as (progress, task):
             unpack(archive, unpacking, limit_bytes=limit_bytes, on_bytes=lambda n: progress.advance(task, n))
         if target.is_dir():

@@ -60,14 +60,14 @@ def points_of_frames(
 
 def _agrees(model: Reconstruction, file: Path, frames: Frames) -> NDArray[np.bool_]:
     """Which cameras have the dataset's pose, (M,)."""
-    apart_m = np.linalg.norm(model.position_m - frames.position_m[model.rows], axis=1)
+    distance_m = np.linalg.norm(model.position_m - frames.position_m[model.rows], axis=1)
     true = torch.from_numpy(frames.quaternion[model.rows])
-    apart_deg = rotation_error_deg(torch.from_numpy(model.quaternion), true).numpy()
-    agrees = (apart_m <= TOLERANCE_M) & (apart_deg <= TOLERANCE_DEG)
+    rotation_deg = rotation_error_deg(torch.from_numpy(model.quaternion), true).numpy()
+    agrees = (distance_m <= TOLERANCE_M) & (rotation_deg <= TOLERANCE_DEG)
     if agrees.mean() < 0.5:
         raise InputError(
-            f"{file}: its cameras are up to {apart_m.max():.3g} m and {apart_deg.max():.3g} degrees off the dataset's "
-            f"poses, more than {TOLERANCE_M:g} m and {TOLERANCE_DEG:g} degrees; bring the model into their frame and "
-            "scale (colmap model_aligner), or remove it"
+            f"{file}: its cameras are up to {distance_m.max():.3g} m and {rotation_deg.max():.3g} degrees off the "
+            f"dataset's poses, more than {TOLERANCE_M:g} m and {TOLERANCE_DEG:g} degrees; bring the model into their "
+            "frame and scale (colmap model_aligner), or remove it"
         )
     return agrees

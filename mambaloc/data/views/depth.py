@@ -25,13 +25,13 @@ from mambaloc.errors import InputError
 from mambaloc.memory import release_pages
 from mambaloc.runtime.maps.viewpoints import farthest_points, spread_m, viewpoints
 from mambaloc.runtime.rotations import matrix_from_quaternion, rigid_transforms
-from mambaloc.synthesis import PosedDepth, carried_depth, depth_from_pictures, without_disagreeing
+from mambaloc.synthesis import PosedDepth, carried_depth, depth_from_images, without_disagreeing
 from mambaloc.synthesis.posed_depth import Floats
 
 ViewDepth = Literal["auto", "sensor", "pictures"]
 VIEW_DEPTHS: tuple[str, ...] = get_args(ViewDepth)
 
-_MOST_FRAMES = 400  # with depth, spread over the poses; more cost time and add little
+_MAX_FRAMES = 400  # with depth, spread over the poses; more cost time and add little
 _ENOUGH_FRAMES = 20  # with depth; where there are fewer than twice as many frames, half of them
 _FAR_OFF = 30.0  # times: no place of one scene, but another unit
 _NAMED = 3  # files in a line
@@ -83,7 +83,7 @@ def depth_of_frames(folder: Path, data: CachedFrames, how: ViewDepth, device: to
         lines = [f"{folder}: {len(rows)} of {len(data.frames)} training frames have depth, too few. {_SEARCHED}"]
     intrinsics = data.intrinsics.double().cpu().numpy()
     try:
-        found = depth_from_pictures(data.images, intrinsics, poses_of(data.frames), device=device)
+        found = depth_from_images(data.images, intrinsics, poses_of(data.frames), device=device)
     except InputError as error:
         raise InputError(" ".join([*lines, str(error)])) from None
     return FoundDepth("pictures", found, lines)
@@ -103,7 +103,7 @@ def from_sensor(folder: Path, data: CachedFrames, rows: list[int]) -> FoundDepth
     if not rows:
         raise InputError(f"{folder}: no training frame has depth. Set data.view_depth to pictures.")
     poses = poses_of(data.frames.select(np.array(rows)))
-    chosen = np.array(rows)[farthest_points(viewpoints(poses, spread_m(poses)), _MOST_FRAMES, first=0)]
+    chosen = np.array(rows)[farthest_points(viewpoints(poses, spread_m(poses)), _MAX_FRAMES, first=0)]
     files = [depth_path(data.frames.image_paths[row]) for row in chosen]
     intrinsics, poses = data.intrinsics[chosen].double().cpu().numpy(), poses_of(data.frames.select(chosen))
     read = read_all(folder, files, intrinsics, (data.images.shape[2], data.images.shape[3]))

@@ -19,7 +19,7 @@ from mambaloc.data.depth_frames import INTRINSICS_FILE, depth_path
 from mambaloc.data.frame_dataset import LoadedSplit
 from mambaloc.data.views.depth import VIEW_DEPTHS, FoundDepth, ViewDepth, depth_of_frames, poses_of
 from mambaloc.errors import InputError, InputWarning
-from mambaloc.files import whole_folder
+from mambaloc.files import atomic_folder
 from mambaloc.synthesis import PosedDepth, Quality, Views, held_out_quality, make_views
 from mambaloc.user_cache import default_cache_dir, fingerprint
 
@@ -157,7 +157,7 @@ def _timed(make: Callable[[], T]) -> tuple[T, float]:
 
 
 def _keep_depth(found: FoundDepth, seconds: float, folder: Path) -> None:
-    with whole_folder(folder, _REMEDY) as partial:
+    with atomic_folder(folder, _REMEDY) as partial:
         for name in _FIELDS:
             np.save(partial / f"{name}.npy", getattr(found.frames, name))
         meta = {"kind": found.kind, "left_out": found.left_out, "seconds": seconds}

@@ -49,15 +49,15 @@ class FramesAndViews(CachedFrames):
         """Of all images."""
         return self.images.nbytes + self.views.nbytes
 
-    def pictures(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+    def images_at(self, rows: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Images of some rows, frames' and views', (B, 3, H, W)."""
         rows = np.asarray(rows)
         is_view = rows >= len(self.frames)
-        pictures = np.empty((len(rows), *self.images.shape[1:]), np.uint8)
-        pictures[~is_view] = self.images[rows[~is_view]]
+        images = np.empty((len(rows), *self.images.shape[1:]), np.uint8)
+        images[~is_view] = self.images[rows[~is_view]]
         release_pages(self.images)
-        pictures[is_view] = self.views.images(rows[is_view] - len(self.frames))
-        return pictures
+        images[is_view] = self.views.images(rows[is_view] - len(self.frames))
+        return images
 
     def replace_views(self, rows: NDArray[np.int64], views: Views, points: ScenePoints | None = None) -> None:
         """Put N views in the place of those in N rows, with the points that each shows if the frames carry points."""
@@ -69,7 +69,7 @@ class FramesAndViews(CachedFrames):
         if self.points_m is not None and points is not None:
             self.points_m[rows] = _like(self.points_m, points.points_m)
         if self.resident is not None and self.resident_holes is not None:
-            self.resident[rows] = torch.from_numpy(self.pictures(rows)).to(device)
+            self.resident[rows] = torch.from_numpy(self.images_at(rows)).to(device)
             self.resident_holes[rows] = torch.from_numpy(self.holes(rows)).to(device)
 
     def to(self, device: torch.device) -> Self:

@@ -27,9 +27,9 @@ from mambaloc.runtime.rotations import quaternion_from_matrix, rotation_error_de
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
 
-_MOST_FRAMES = 100  # the others move with their neighbours
-_LEAST_POINTS = 50
-_LEAST_FRAMES = 8  # of each camera, so that its lens is fitted
+_MAX_FRAMES = 100  # the others move with their neighbours
+_MIN_POINTS = 50
+_MIN_FRAMES = 8  # of each camera, so that its lens is fitted
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def adjust_poses(capture: Capture) -> Adjusted:
     Raises:
         InputError: where its images give too few points.
     """
-    every, stride = np.arange(len(capture.images)), -(-len(capture.images) // _MOST_FRAMES)
+    every, stride = np.arange(len(capture.images)), -(-len(capture.images) // _MAX_FRAMES)
     rows = every[::stride]
     given = capture.world_from_cam[rows]
     pairs = pairs_by_pose(given)
@@ -85,7 +85,7 @@ def adjust_poses(capture: Capture) -> Adjusted:
         depth = [sampled(capture.depth, row, each.rays) for row, each in zip(rows.tolist(), features, strict=True)]
     names, camera = _cameras(capture, rows)
     structure = recover_structure(features, given, pairs, matches, np.random.default_rng(0), depth, camera)
-    if len(structure.points_m) < _LEAST_POINTS:
+    if len(structure.points_m) < _MIN_POINTS:
         raise InputError(
             f"--adjust-poses: the images give {len(structure.points_m)} points. Film more texture, or leave it out."
         )
@@ -108,7 +108,7 @@ def _cameras(capture: Capture, rows: Indices) -> tuple[list[str], Indices | None
     if capture.camera_of is None:
         return [], None
     names, camera = np.unique([capture.camera_of[row] for row in rows], return_inverse=True)
-    return names.tolist(), camera if np.bincount(camera).min() >= _LEAST_FRAMES else None
+    return names.tolist(), camera if np.bincount(camera).min() >= _MIN_FRAMES else None
 
 
 def _focal(

@@ -19,7 +19,7 @@ from mambaloc.importing.motion import Motion
 
 Floats = NDArray[np.floating[Any]]
 
-_LEAST_MATCHES = 200
+_MIN_MATCHES = 200
 _AGREE = 0.3  # a tenth of matches agree with any poses
 _PLAINLY = 0.2
 _CLEARLY = 0.1
@@ -68,7 +68,7 @@ class Agreement:
     @property
     def is_known(self) -> bool:
         """Whether there are matches enough to say anything."""
-        return self.matches >= _LEAST_MATCHES
+        return self.matches >= _MIN_MATCHES
 
     @property
     def focal(self) -> float:
@@ -128,16 +128,16 @@ def check_agreement(found: Agreement) -> list[Finding]:
     }
     name, share = "images and poses", found.share[AS_READ]
     if not found.is_known:
-        said = f"not compared: {found.matches} matches on {found.pairs} pairs of images"
+        message = f"not compared: {found.matches} matches on {found.pairs} pairs of images"
         concern = (
             f"nothing could be compared: {found.matches} matches between images are too few to check whether the poses "
             "fit; look at trajectory.png, and give larger or more textured images if you can"
         )
-        return [Finding(name, said, concern, figures=figures)]
+        return [Finding(name, message, concern, figures=figures)]
     others = max(share for convention, share in found.share.items() if convention != AS_READ)
     guessed = ", focal length guessed" if found.is_guessed else ""
-    said = f"{share:.0%} of {found.matches} matches on {found.pairs} pairs agree{guessed} (otherwise: {others:.0%})"
-    findings = [Finding(name, said, found.contradiction, figures=figures), _check_focal(found)]
+    message = f"{share:.0%} of {found.matches} matches on {found.pairs} pairs agree{guessed} (otherwise: {others:.0%})"
+    findings = [Finding(name, message, found.contradiction, figures=figures), _check_focal(found)]
     if found.depth is not None:
         findings.append(_check_depth(found.depth, found.focal_px))
     if found.adjusted is not None:
@@ -195,14 +195,14 @@ def _check_focal(found: Agreement) -> Finding:
         "share_at_given": round(given, 4), "share_at_best": round(best, 4),
     }  # fmt: skip
     kind = "guessed" if found.is_guessed else "given"
-    said = f"{found.focal_px:.0f} px {kind}, {given:.0%} of matches agree; most at {focal_px:.0f} px, {best:.0%}"
+    message = f"{found.focal_px:.0f} px {kind}, {given:.0%} of matches agree; most at {focal_px:.0f} px, {best:.0%}"
     concern = ""
     if found.is_of_another_lens and found.best == AS_READ:
         concern = (
             f"the focal length looks like {focal_px:.0f} px rather than {found.focal_px:.0f}: {best:.0%} of matches "
             f"agree, not {given:.0%}; check that the intrinsics are of images of this size"
         )
-    return Finding("focal length", said, concern, figures=figures)
+    return Finding("focal length", message, concern, figures=figures)
 
 
 def _check_depth(found: ByDepth, focal_px: float) -> Finding:
@@ -211,7 +211,7 @@ def _check_depth(found: ByDepth, focal_px: float) -> Finding:
         "best_focal_px": round(found.focal * focal_px, 2), "off_at_best_focal_px": round(found.focal_px.min(), 2),
         "best_turns": found.turn, "off_at_best_turns_px": round(found.turn_px.min(), 2),
     }  # fmt: skip
-    said = (
+    message = (
         f"{found.matches} matches lifted by depth are {found.given_px:.1f} px off (median); least at a focal length of "
         f"{found.focal * focal_px:.0f} px ({found.focal_px.min():.1f} px), or at turns times {found.turn:.3g} "
         f"({found.turn_px.min():.1f} px)"
@@ -222,7 +222,7 @@ def _check_depth(found: ByDepth, focal_px: float) -> Finding:
             f"depth fits a focal length of {found.focal * focal_px:.0f} px better than {focal_px:.0f}: matches are "
             f"{found.focal_px.min():.1f} px off, not {found.given_px:.1f}; check the intrinsics of images and depth"
         )
-    return Finding("depth", said, concern, figures=figures)
+    return Finding("depth", message, concern, figures=figures)
 
 
 def _of_adjusted(found: Adjusted) -> Finding:
@@ -231,16 +231,16 @@ def _of_adjusted(found: Adjusted) -> Finding:
         "moved": round(found.moved, 6), "turned_deg": round(found.turned_deg, 3), "with_depth": found.with_depth,
         "focal_over_given": {name: round(scale, 4) for name, scale in found.focal.items()},
     }  # fmt: skip
-    said = (
+    message = (
         f"{found.frames} frames and {found.points} points adjusted: camera centres moved by {found.moved:.3g}, cameras "
         f"turned by {found.turned_deg:.2g}° (medians); turns between frames are {found.turns:.3g} of those given"
     )
     if found.focal:
-        said += "; focal length " + ", ".join(f"{scale:.4f} ({name})" for name, scale in found.focal.items())
-    return Finding("adjusted poses", said, figures=figures)
+        message += "; focal length " + ", ".join(f"{scale:.4f} ({name})" for name, scale in found.focal.items())
+    return Finding("adjusted poses", message, figures=figures)
 
 
 def _rounded(each: Bin) -> dict[str, float | None]:
     """A bin as ``scene.json`` has it, which knows no infinity."""
-    told = {name: None if value is None else round(value, 4) for name, value in asdict(each).items()}
-    return {**told, "high": None if np.isinf(each.high) else told["high"]}
+    rounded = {name: None if value is None else round(value, 4) for name, value in asdict(each).items()}
+    return {**rounded, "high": None if np.isinf(each.high) else rounded["high"]}

@@ -89,8 +89,8 @@ def check_up(capture: Capture, up: Up, are_contradicted: bool = False) -> Findin
             "up", f"unknown: cameras point all ways (agreement {up.common:.2f} of 1)", concern, figures=figures
         )
     place = f"{up.axis}, {up.off_deg:.0f}° off" if up.world_axis is not None else f"{up.off_deg:.0f}° from {up.axis}"
-    said = f"{place}; cameras' own is {up.spread_deg:.0f}° from their mean (agreement {up.common:.2f} of 1)"
-    return Finding("up", said, concern, figures=figures)
+    message = f"{place}; cameras' own is {up.spread_deg:.0f}° from their mean (agreement {up.common:.2f} of 1)"
+    return Finding("up", message, concern, figures=figures)
 
 
 def check_axes(capture: Capture) -> Finding:
@@ -108,8 +108,8 @@ def check_axes(capture: Capture) -> Finding:
     if share > 0.5:
         return Finding("optical axes", "meet nowhere", figures=figures)
     where = "in front of" if in_front >= _IN_FRONT else "behind" if in_front <= 1 - _IN_FRONT else "before and behind"
-    said = f"meet {where} the cameras, missing a point by {share:.0%} of its distance (median)"
-    return Finding("optical axes", said, figures=figures)
+    message = f"meet {where} the cameras, missing a point by {share:.0%} of its distance (median)"
+    return Finding("optical axes", message, figures=figures)
 
 
 def _angle_deg(cosine: Floats | float) -> Floats:

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.data.depth_frames import NO_DEPTH_MM, read_depth_mm, read_whole_png
+from mambaloc.data.depth_frames import NO_DEPTH_MM, read_complete_png, read_depth_mm
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture, Depth
-from mambaloc.importing.checks.epipolar import apart_of
+from mambaloc.importing.checks.epipolar import pair_distances
 from mambaloc.importing.checks.matching import Matches
 
 Floats = NDArray[np.floating[Any]]
@@ -26,7 +26,7 @@ SCALES = np.round(np.arange(0.80, 1.2001, 0.005), 4)
 """Focal lengths and turns that are tried, over those of the capture."""
 
 _TURNED_DEG = (4.0, 20.0)  # less says little, and more is often matched wrongly
-_LEAST_MATCHES = 100
+_MIN_MATCHES = 100
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ def by_depth(capture: Capture, matches: Matches) -> ByDepth | None:
     """
     if capture.depth is None:
         return None
-    turn_deg = apart_of(matches, capture.world_from_cam)[1]
+    turn_deg = pair_distances(matches, capture.world_from_cam)[1]
     pairs = np.flatnonzero((turn_deg >= _TURNED_DEG[0]) & (turn_deg <= _TURNED_DEG[1]))
     chosen = matches.of_pairs(pairs)
     depth = depth_of_matches(capture.depth, chosen)
     has_depth = np.isfinite(depth)
-    if has_depth.sum() < _LEAST_MATCHES:
+    if has_depth.sum() < _MIN_MATCHES:
         return None
 
     def median_px(focal: float, turn: float) -> float:
@@ -133,7 +133,7 @@ def _confidence(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     Raises:
         InputError: where it is not a whole PNG of 8 bits and that shape.
     """
-    found = read_whole_png(path)
+    found = read_complete_png(path)
     if found is None or found.dtype != np.uint8 or found.shape != shape:
         raise InputError(
             f"{path}: is not a complete 8-bit PNG of one channel and the size of its depth frame, "

@@ -26,8 +26,8 @@ NEAR_PX = 1.5
 FOCALS = np.round(1.0125 ** np.arange(-28, 28), 4)
 """Focal lengths that are tried, over that of the capture."""
 
-_LEAST_OF_A_PAIR = 20  # matches; poses fitted to fewer agree with too many
-_MOST_BINS = 6
+_MIN_MATCHES = 20  # matches; poses fitted to fewer agree with too many
+_MAX_BINS = 6
 _FOCAL_TURN_DEG = 8.0  # of pairs by which the focal length is judged: errors of poses grow with their turns
 _FOCAL_MATCHES = 400
 
@@ -84,30 +84,30 @@ def by_baseline(matches: Matches, world_from_cam: Floats, adjusted: Floats | Non
         adjusted: other poses of the frames, in the same bins.
     """
     counts = matches.per_pair()
-    enough = np.flatnonzero(counts >= _LEAST_OF_A_PAIR)
+    enough = np.flatnonzero(counts >= _MIN_MATCHES)
     if not len(enough):
         return []
     agreeing = matches.per_pair(agrees(matches, world_from_cam))
     possible = np.array([max(_fitted(matches, pair), agreeing[pair]) for pair in enough.tolist()])
     counts, agreeing = counts[enough], agreeing[enough]
     after = None if adjusted is None else matches.per_pair(agrees(matches, adjusted))[enough]
-    baseline, turn_deg = (each[enough] for each in apart_of(matches, world_from_cam))
+    baseline, turn_deg = (each[enough] for each in pair_distances(matches, world_from_cam))
     edges = _round_edges(baseline)
     found = []
     for low, high in pairwise(edges):
         here = (baseline >= low) & (baseline < high)
         if not (total := int(counts[here].sum())):
             continue
-        share, most = float(agreeing[here].sum() / total), float(possible[here].sum() / total)
+        share, possible_share = float(agreeing[here].sum() / total), float(possible[here].sum() / total)
         share_after = None if after is None else float(after[here].sum() / total)
         middle_deg = float(np.median(turn_deg[here]))
-        found.append(Bin(low, high, middle_deg, int(here.sum()), total, share, most, share_after))
+        found.append(Bin(low, high, middle_deg, int(here.sum()), total, share, possible_share, share_after))
     return found
 
 
 def by_focal(matches: Matches, world_from_cam: Floats) -> Floats:
     """The share of matches that agree at each of :data:`FOCALS`, by pairs turned little where there are some."""
-    little = np.flatnonzero(apart_of(matches, world_from_cam)[1] <= _FOCAL_TURN_DEG)
+    little = np.flatnonzero(pair_distances(matches, world_from_cam)[1] <= _FOCAL_TURN_DEG)
     judged = matches.of_pairs(little)
     judged = judged if len(judged.pair) >= _FOCAL_MATCHES else matches
     return np.array([agrees(judged, world_from_cam, focal).mean() for focal in FOCALS])
@@ -122,7 +122,7 @@ def best_focal(share: Floats) -> float:
     return float(FOCALS[at] * (FOCALS[at + 1] / FOCALS[at]) ** offset)
 
 
-def apart_of(matches: Matches, world_from_cam: Floats) -> tuple[Floats, Floats]:
+def pair_distances(matches: Matches, world_from_cam: Floats) -> tuple[Floats, Floats]:
     """How far the images of each pair are apart, in the capture's unit and in degrees, (P,) each."""
     first, second = world_from_cam[matches.pairs.T]
     turn_deg = rotation_error_deg(*(quaternion_from_matrix(each[:, :3, :3]) for each in (first, second)))
@@ -133,7 +133,7 @@ def _round_edges(values: Floats) -> list[float]:
     """Edges 1, 2, 5, 10, ... around some lengths, so many at most: the first and last bin hold what is left."""
     steps = np.array([digit * 10.0**power for power in range(-9, 10) for digit in (1, 2, 5)])
     low, high = np.quantile(values, (0.02, 0.98))
-    inner = steps[(steps > low) & (steps < high)][-(_MOST_BINS - 1) :]
+    inner = steps[(steps > low) & (steps < high)][-(_MAX_BINS - 1) :]
     return [0.0, *inner.tolist(), float("inf")]
 
 

@@ -52,7 +52,7 @@ CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
 }
 """What makes ``world_from_cam`` in OpenCV's axes of poses that were meant otherwise."""
 
-_MOST_SHIFT = 15  # frames
+_MAX_SHIFT = 15  # frames
 _CLEARLY = 0.05
 _DEVIATIONS = 3.0
 
@@ -108,7 +108,7 @@ def _orders(sequences: Sequence[str], images: Sequence[Path]) -> dict[str, Indic
         "the images sorted by the numbers in their names": natural,
     }
     orders |= {name: np.empty_like(every) for name in by_name}
-    shifts = [shift for shift in range(-_MOST_SHIFT, _MOST_SHIFT + 1) if shift]
+    shifts = [shift for shift in range(-_MAX_SHIFT, _MAX_SHIFT + 1) if shift]
     orders |= {_shifted(shift): np.full_like(every, -1) for shift in shifts}
     for sequence in dict.fromkeys(sequences):
         rows = np.flatnonzero(of == sequence)

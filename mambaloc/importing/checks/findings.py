@@ -13,14 +13,14 @@ class Finding:
 
     Args:
         name: what.
-        said: the result, in a line.
+        message: the result, in a line.
         concern: why care is needed, in a line; empty where none is.
         is_fatal: nothing can be trained because of it.
         figures: what was measured.
     """
 
     name: str
-    said: str
+    message: str
     concern: str = ""
     is_fatal: bool = False
     figures: Mapping[str, Any] = field(default_factory=dict)

@@ -56,10 +56,10 @@ def astray(world_from_cam: Floats) -> dict[int, str]:
     if not len(position):
         return {}
     distance = np.linalg.norm(position - np.median(position, axis=0), axis=1)
-    most = max(_ASTRAY * float(np.quantile(distance, 0.75)), _BLURRED)
+    max_distance = max(_ASTRAY * float(np.quantile(distance, 0.75)), _BLURRED)
     return {
         row: f"the position is {distance[row]:.3g} from the middle of the others, over {_ASTRAY:g} times their spread"
-        for row in np.flatnonzero(distance > most).tolist()
+        for row in np.flatnonzero(distance > max_distance).tolist()
     }
 
 
@@ -79,13 +79,13 @@ def _marks(world_from_cam: Floats, sequences: NDArray[np.str_], is_zero: Rows, i
         _, first, count = np.unique(quaternion[zeros].round(6), axis=0, return_inverse=True, return_counts=True)
         return zeros[count[first.ravel()] > 1].tolist()
     step_deg = np.median(rotation_error_deg(quaternion[fixed[later]], quaternion[fixed[later - 1]]))
-    most, most_deg = max(_JUMP_STEPS * step, _JUMP_SHARE * extent), max(_JUMP_STEPS * step_deg, _JUMP_DEG)
+    max_step, max_step_deg = max(_JUMP_STEPS * step, _JUMP_SHARE * extent), max(_JUMP_STEPS * step_deg, _JUMP_DEG)
     marks = []
     for row in zeros.tolist():
         place = int(np.searchsorted(fixed, row))
         around = [each for each in fixed[max(place - 1, 0) : place + 1] if sequences[each] == sequences[row]]
         off = [np.linalg.norm(world_from_cam[each, :3, 3]) for each in around]
         turned_deg = [rotation_error_deg(quaternion[row], quaternion[each]) for each in around]
-        if around and (min(off) > most or min(turned_deg) > most_deg):
+        if around and (min(off) > max_step or min(turned_deg) > max_step_deg):
             marks.append(row)
     return marks

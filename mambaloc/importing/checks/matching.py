@@ -16,7 +16,7 @@ from rich.progress import track
 from mambaloc.data.cameras import assumed_intrinsics
 from mambaloc.images import Image, read_image
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.motion import Motion, apart, quaternions
+from mambaloc.importing.motion import Motion, pairwise_distances, quaternions
 from mambaloc.mapping.pairs import pairs_by_pose
 from mambaloc.mapping.tracks import match
 from mambaloc.runtime.maps.features import Features, detect_features
@@ -30,10 +30,10 @@ LONG_SIDE_PX = 640
 """Longest side of the images in which keypoints are searched."""
 
 _NEIGHBOURS = 16  # frames, with another that is turned little and one that is turned more
-_OFFSETS = (32, 24, 16, 12, 8, 6, 4, 3, 2, 1)  # frames from one of a pair to the other; far apart they tell more
-_MOST_TURNS_DEG = (8.0, 15.0)
-_LEAST_MOVE = 0.01  # of the extent; turned on the spot, a camera draws no lines
-_MOST_FRAMES = 32  # that pairs by pose are chosen from
+_OFFSETS = (32, 24, 16, 12, 8, 6, 4, 3, 2, 1)  # frames from one of a pair to the other; larger baselines constrain more
+_MAX_TURNS_DEG = (8.0, 15.0)
+_MIN_MOVE = 0.01  # of the extent; turned on the spot, a camera draws no lines
+_MAX_FRAMES = 32  # that pairs by pose are chosen from
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,10 @@ def neighbours(capture: Capture, motion: Motion) -> list[tuple[int, int]]:
         others = np.array(
             [other for other in others if capture.sequences[other] == capture.sequences[row]], dtype=np.int64
         )
-        length, turn_deg = (each[0] for each in apart(position, quaternion, every[row : row + 1], others))
+        length, turn_deg = (each[0] for each in pairwise_distances(position, quaternion, every[row : row + 1], others))
         pairs = set()
-        for most_deg in _MOST_TURNS_DEG:
-            fits = np.flatnonzero((turn_deg <= most_deg) & (length >= _LEAST_MOVE * motion.extent))
+        for max_turn_deg in _MAX_TURNS_DEG:
+            fits = np.flatnonzero((turn_deg <= max_turn_deg) & (length >= _MIN_MOVE * motion.extent))
             if len(fits):
                 place = fits[0] if motion.in_order else fits[length[fits].argmin()]
                 pairs.add((int(row), int(others[place])))
@@ -158,7 +158,7 @@ def _by_pose(capture: Capture, near: list[tuple[int, int]]) -> list[tuple[int, i
     rows = np.array(sorted({row for pair in near for row in pair}), np.int64)
     if capture.depth is not None:
         rows = np.array([row for row, file in enumerate(capture.depth.files) if file is not None], np.int64)
-    rows = rows[np.linspace(0, len(rows) - 1, min(_MOST_FRAMES, len(rows))).round().astype(int)]
+    rows = rows[np.linspace(0, len(rows) - 1, min(_MAX_FRAMES, len(rows))).round().astype(int)]
     if len(rows) < 2:
         return []
     return [(int(rows[one]), int(rows[other])) for one, other in pairs_by_pose(capture.world_from_cam[rows])]

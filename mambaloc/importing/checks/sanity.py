@@ -16,12 +16,12 @@ from mambaloc.importing.undistort.decoding import Decoding
 from mambaloc.runtime.camera_models import is_same_shape
 from mambaloc.runtime.rotations import is_rotation
 
-LEAST_FRAMES = 20
+MIN_FRAMES = 20
 _DUPLICATE_SHARE = 1e-6  # of the extent
 _DUPLICATE_DEG = 1e-3
 _MANY = 0.1
 _NAMED = 3
-_LEAST_STILL = 3  # successive frames
+_MIN_STILL = 3  # successive frames
 _MUCH = 2.0
 
 
@@ -66,17 +66,17 @@ def check_frames(capture: Capture, left_out: Mapping[str, str]) -> Finding:
     """
     kept, rules = len(capture.images), Counter(rule.partition(" (")[0] for rule in left_out.values())
     causes = [f"{count} left out: {rule}" for rule, count in rules.most_common()]
-    said = "; ".join((f"{kept}", *causes[:_NAMED]))
+    message = "; ".join((f"{kept}", *causes[:_NAMED]))
     figures = {"kept": kept, "left_out": dict(rules)}
-    if kept < LEAST_FRAMES:
+    if kept < MIN_FRAMES:
         causes += _without(capture)
-        concern = f"{kept} usable frames, and {LEAST_FRAMES} are needed to train on some and to test on others"
+        concern = f"{kept} usable frames, and {MIN_FRAMES} are needed to train on some and to test on others"
         concern += f" ({'; '.join(causes)})" if causes else ""
-        return Finding("frames", said, concern, is_fatal=True, figures=figures)
+        return Finding("frames", message, concern, is_fatal=True, figures=figures)
     concern = ""
     if left_out:
         concern = f"{len(left_out)} of {kept + len(left_out)} frames are left out ({rules.most_common(1)[0][0]})"
-    return Finding("frames", said, concern, figures=figures)
+    return Finding("frames", message, concern, figures=figures)
 
 
 def _without(capture: Capture) -> list[str]:
@@ -92,9 +92,9 @@ def _without(capture: Capture) -> list[str]:
 def check_missing(capture: Capture) -> Finding:
     """Say which images have no pose and which poses no image."""
     without_image, without_pose = capture.poses_without_image, capture.images_without_pose
-    said = f"{len(without_image)} without image, {len(without_pose)} images without pose"
+    message = f"{len(without_image)} without image, {len(without_pose)} images without pose"
     if without_image:
-        said += f" ({_some(without_image)})"
+        message += f" ({_some(without_image)})"
     listed = len(capture.images) + len(without_image)
     concern = ""
     if len(without_image) > _MANY * listed:
@@ -102,13 +102,13 @@ def check_missing(capture: Capture) -> Finding:
     elif len(without_pose) > len(capture.images):
         concern = f"{len(without_pose)} images have no pose, more than have one"
     figures = {"poses_without_image": len(without_image), "images_without_pose": len(without_pose)}
-    return Finding("poses", said, concern, figures=figures)
+    return Finding("poses", message, concern, figures=figures)
 
 
 def check_sizes(sizes: Sequence[tuple[int, int]]) -> Finding:
     """Say how large the images are, (width, height) of each."""
     counted = Counter(sizes).most_common(_NAMED)
-    said = ", ".join(
+    message = ", ".join(
         f"{width}x{height}" + (f" ({count})" if len(counted) > 1 else "") for (width, height), count in counted
     )
     odd = sum(not is_same_shape(size, counted[0][0]) for size in sizes)
@@ -119,7 +119,7 @@ def check_sizes(sizes: Sequence[tuple[int, int]]) -> Finding:
             "every shape holds; data.image_size must be square for upright and lying ones"
         )
     figures = {"sizes": {f"{width}x{height}": count for (width, height), count in counted}, "of_another_shape": odd}
-    return Finding("image size", said, concern, figures=figures)
+    return Finding("image size", message, concern, figures=figures)
 
 
 def check_pixels(decoding: Decoding) -> Finding:
@@ -145,13 +145,13 @@ def check_steps(capture: Capture, motion: Motion, unit: str) -> Finding:
         "jumps": jumps,
     }
     if not motion.in_order:
-        said = f"no path; the nearest frame is {motion.step:.3g} {unit} and {motion.step_deg:.1f}° away (median)"
+        message = f"no path; the nearest frame is {motion.step:.3g} {unit} and {motion.step_deg:.1f}° away (median)"
         concern = "the frames are in no order of time: a split by blocks is one by place, and clips make no sense"
-        return Finding("steps", said, concern, figures=figures)
+        return Finding("steps", message, concern, figures=figures)
     largest = f"{motion.length.max():.3g} {unit}"
-    said = f"median {motion.step:.3g} {unit} and {motion.step_deg:.1f}°, largest {largest}; {len(jumps)} jumps"
+    message = f"median {motion.step:.3g} {unit} and {motion.step_deg:.1f}°, largest {largest}; {len(jumps)} jumps"
     concern = f"the camera jumps {len(jumps)} times (to {_some(jumps)})" if jumps else ""
-    return Finding("steps", said, concern, figures=figures)
+    return Finding("steps", message, concern, figures=figures)
 
 
 def check_duplicates(capture: Capture, motion: Motion) -> Finding:
@@ -168,7 +168,7 @@ def check_duplicates(capture: Capture, motion: Motion) -> Finding:
     if many >= len(grid) - 1:
         concern = "all frames have the same pose: the tracker was lost, or did not move; export poses that differ"
         return Finding("duplicate poses", f"{many}", concern, True, {"count": many})
-    if len(run) >= _LEAST_STILL:
+    if len(run) >= _MIN_STILL:
         first, last = (capture.images[run[end]].name for end in (0, -1))
         concern = (
             f"{many} frames have exactly the pose of another, most in a row {first} to {last} ({len(run)} frames): a "
@@ -194,15 +194,15 @@ def check_extent(capture: Capture, motion: Motion, unit: str) -> Finding:
     """Say how large the box around nine tenths of the camera centres is, and around all where that is much larger."""
     position = capture.world_from_cam[:, :3, 3]
     sides, all_sides = sides_of(position), np.ptp(position, axis=0)
-    said = f"{' x '.join(f'{side:.3g}' for side in sides)} {unit} along x, y, z (nine tenths of the frames)"
+    message = f"{' x '.join(f'{side:.3g}' for side in sides)} {unit} along x, y, z (nine tenths of the frames)"
     if np.linalg.norm(all_sides) > _MUCH * np.linalg.norm(sides):
-        said += f"; of all frames {' x '.join(f'{side:.3g}' for side in all_sides)}"
+        message += f"; of all frames {' x '.join(f'{side:.3g}' for side in all_sides)}"
     figures = {
         "sides": sides.round(6).tolist(),
         "sides_of_all": all_sides.round(6).tolist(),
         "diagonal_of_nine_tenths": round(motion.extent, 6),
     }
-    return Finding("extent", said, figures=figures)
+    return Finding("extent", message, figures=figures)
 
 
 def check_times(capture: Capture) -> Finding:
@@ -212,7 +212,7 @@ def check_times(capture: Capture) -> Finding:
     names = np.array(capture.sequences)
     steps = np.diff(capture.time_s)[names[1:] == names[:-1]]
     backwards, still = int((steps < 0).sum()), int((steps == 0).sum())
-    said = (
+    message = (
         f"median {np.median(steps):.3g} s from frame to frame, longest {steps.max():.3g} s"
         if len(steps)
         else "one frame"
@@ -220,7 +220,7 @@ def check_times(capture: Capture) -> Finding:
     concern = ""
     if backwards or still:
         concern = f"time goes back {backwards} times and stands still {still} times from a frame to the next"
-    return Finding("time", said, concern, figures={"backwards": backwards, "still": still})
+    return Finding("time", message, concern, figures={"backwards": backwards, "still": still})
 
 
 def _some(names: Sequence[str]) -> str:

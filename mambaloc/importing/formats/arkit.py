@@ -71,7 +71,7 @@ def read_record3d(source: Path) -> Capture:
     folder = first_with_images([source / "rgbd", source / "rgb"])
     images = list_images(folder)
     numbered = {number_of(image): image for image in images}
-    names, cameras = told_apart(_record3d_cameras(metadata, path, len(rows)))
+    names, cameras = distinguish_cameras(_record3d_cameras(metadata, path, len(rows)))
     stamps = metadata.get("frameTimestamps")
     times = [None] * len(rows) if stamps is None else array_of(stamps, (len(rows),), "frameTimestamps", path).tolist()
     sequence = folder_name(source)
@@ -108,7 +108,7 @@ def read_polycam(source: Path) -> Capture:
     read = [_polycam_frame(file, images[file.stem]) for file in present]
     matrices = np.array([matrix for matrix, _ in read]).reshape(-1, 3, 4)
     checked = validate_se3(matrices, lambda row: str(present[row])) @ OPENCV_FROM_OPENGL
-    names, cameras = told_apart([camera for _, camera in read])
+    names, cameras = distinguish_cameras([camera for _, camera in read])
     stamps = all(number_of(file) >= 0 for file in present)
     posed = [
         Posed(
@@ -151,7 +151,7 @@ def _record3d_cameras(metadata: dict[str, object], path: Path, count: int) -> li
     return [pinhole(size, (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), path) for fx, fy, cx, cy in rows.tolist()]
 
 
-def told_apart(cameras: list[Camera]) -> tuple[list[str], dict[str, Camera]]:
+def distinguish_cameras(cameras: list[Camera]) -> tuple[list[str], dict[str, Camera]]:
     """A name for each camera, the same for equal ones, and the cameras by name."""
     names = {camera: f"camera-{number}" for number, camera in enumerate(dict.fromkeys(cameras))}
     return [names[camera] for camera in cameras], {name: camera for camera, name in names.items()}
@@ -195,8 +195,8 @@ def _polycam_size(frame: dict[str, object], center: Sequence[float], path: Path,
     """
     raw = path.parent.with_name(path.parent.name.removeprefix("corrected_")) / path.name
     for file in dict.fromkeys((path, raw)):
-        told = frame if file == path else read_object(file, "a camera of Polycam") if file.is_file() else {}
-        sides = [told.get("width"), told.get("height")]
+        content = frame if file == path else read_object(file, "a camera of Polycam") if file.is_file() else {}
+        sides = [content.get("width"), content.get("height")]
         if sides == [None, None]:
             continue
         size = array_of(sides, (2,), "width, height", file).tolist()

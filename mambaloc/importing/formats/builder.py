@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mambaloc.data.datasets.capture import MOST_FRAMES
+from mambaloc.data.datasets.capture import MAX_FRAMES
 from mambaloc.data.frames import ROTATION_TOLERANCE, UNIT_TOLERANCE
 from mambaloc.errors import InputError
 from mambaloc.images import LARGEST_SIDE_PX
@@ -114,8 +114,8 @@ def build_capture(
     if not posed:
         named = f"; {len(missing)} are named and missing, such as {missing[0]!r}" if missing else ""
         raise InputError(f"{source}: has no image with a pose{named}; add them")
-    if len(posed) > MOST_FRAMES:
-        raise InputError(f"{source}: lists {len(posed)} frames, more than {MOST_FRAMES}; keep fewer")
+    if len(posed) > MAX_FRAMES:
+        raise InputError(f"{source}: lists {len(posed)} frames, more than {MAX_FRAMES}; keep fewer")
     used: set[Path] = set()
     for each in posed:
         if each.image in used:
@@ -221,9 +221,9 @@ def _faults(
     return faults, usable
 
 
-def _repaired(name: str, what: str, off: Matrices, least: float, where: Callable[[int], str]) -> dict[str, str]:
+def _repaired(name: str, what: str, off: Matrices, tolerance: float, where: Callable[[int], str]) -> dict[str, str]:
     """How many rotations were made exact, and the largest repair; nothing where none is more than rounding."""
-    count, worst = int((off > least).sum()), int(off.argmax()) if len(off) else 0
+    count, worst = int((off > tolerance).sum()), int(off.argmax()) if len(off) else 0
     if not count:
         return {}
     return {name: f"{count} of {len(off)} were not {what}, and made so; at most {off[worst]:.2g} off ({where(worst)})"}

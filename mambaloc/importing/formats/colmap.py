@@ -81,7 +81,7 @@ def read_colmap(source: Path, images: Path | None = None) -> Capture:
         "direction": "world-to-camera in the file, inverted",
         "scale": "unknown: COLMAP's is arbitrary",
         "origin": "kept",
-        "model": _said(source, models),
+        "model": _model_choice(source, models),
         **found.choices,
         **checked.choices,
     }
@@ -119,7 +119,7 @@ def _used(images: list[Any]) -> list[int]:
     return sorted({image.camera_id for image in images})
 
 
-def _said(source: Path, models: list[Path]) -> str:
+def _model_choice(source: Path, models: list[Path]) -> str:
     """Which model was read, and which were not."""
     first, *others = (model.relative_to(source).as_posix() for model in models)
     if not others:
@@ -134,11 +134,11 @@ def _find(source: Path, model: Path, images: Path | None, names: list[str]) -> F
     if source in (model, model.parent):  # a model's own folder, such as sparse/0: images are beside sparse
         root = source.resolve()
         folders += [root.parent / "images", root.parent.parent / "images"]
-    folder, most = images or source, 0
+    folder, best_count = images or source, 0
     for candidate in folders if images is None else ():
         count = count_there(candidate, names)
-        folder, most = (candidate, count) if count > most else (folder, most)
-        if most == len(names):
+        folder, best_count = (candidate, count) if count > best_count else (folder, best_count)
+        if best_count == len(names):
             break
     return find_images(folder, [(name, f"{model}, images") for name in names])
 
@@ -170,10 +170,10 @@ def _pinhole(camera: Any) -> tuple[tuple[float, float], tuple[float, float]]:
 
 def _lens(camera: Any) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """The same lens in OpenCV's terms, where it has some; or else pycolmap's, NaN for rays that it does not see."""
-    told = [float(camera.params[at]) for at in camera.extra_params_idxs()]
+    coefficients = [float(camera.params[at]) for at in camera.extra_params_idxs()]
     for model, names in ((OpenCVModel, _OPENCV), (FisheyeModel, _FISHEYES)):
         if camera.model_name in names:
-            return model(*_pinhole(camera), told + [0.0] * (min(model.counts) - len(told)))
+            return model(*_pinhole(camera), coefficients + [0.0] * (min(model.counts) - len(coefficients)))
 
     def distorted(rays: NDArray[np.float64]) -> NDArray[np.float64]:
         points: NDArray[np.float64] = np.column_stack([rays, np.ones(len(rays))])

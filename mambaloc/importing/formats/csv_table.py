@@ -208,7 +208,7 @@ def _by_image(path: Path, rows: list[Row], columns: TableColumns, given: Path | 
     images, how = found.files, "; ".join(filter(None, ("by name", found.elsewhere)))
     stamps = None
     if columns.time is not None:
-        stamps = stamps_of([row[columns.time] for _, row in rows], said=columns.time_unit)
+        stamps = stamps_of([row[columns.time] for _, row in rows], stated_unit=columns.time_unit)
         if stamps is None:
             line, row = next(((line, row) for line, row in rows if stamps_of([row[columns.time]]) is None), rows[0])
             time = row[columns.time][:40]

@@ -163,8 +163,8 @@ def _sensor(path: Path) -> Mapping[str, Any]:
 
 
 def _transform(content: Mapping[str, Any], path: Path) -> Matrices:
-    told = content.get("T_BS")
-    rows = told.get("data") if isinstance(told, Mapping) else told
+    value = content.get("T_BS")
+    rows = value.get("data") if isinstance(value, Mapping) else value
     matrix = array_of(np.ravel(rows).tolist() if isinstance(rows, list) else rows, (16,), "T_BS", path).reshape(4, 4)
     (pose,) = validate_se3(matrix[None], lambda _: f"{path}: T_BS").poses
     if np.isnan(pose).any():  # a mark of no fix, which no calibration has
@@ -189,15 +189,15 @@ def _camera(path: Path) -> tuple[Camera, Matrices]:
         raise InputError(
             f"{path}: camera_model {str(content['camera_model'])[:40]!r} is not read, only pinhole; calibrate it so"
         )
-    told = content.get("distortion_coefficients") or []
-    if model in _NO_LENS and not told:
+    listed = content.get("distortion_coefficients") or []
+    if model in _NO_LENS and not listed:
         return camera, body_from_cam
     if not isinstance(model, str) or model not in _LENSES:
         raise InputError(
             f"{path}: distortion_model {str(model)[:40]!r} is not one of {', '.join(_LENSES)}; calibrate it so"
         )
     lens, counts = _LENSES[model]
-    coefficients = array_of(told, (None,), "distortion_coefficients", path).tolist()
+    coefficients = array_of(listed, (None,), "distortion_coefficients", path).tolist()
     if len(coefficients) not in counts:
         raise InputError(
             f"{path}: has {len(coefficients)} distortion_coefficients, {model} has {counts[0]}; correct it"

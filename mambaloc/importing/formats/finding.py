@@ -24,7 +24,7 @@ SMALLER = ("_2", "_4", "_8")
 """What the folders of smaller copies add to a folder's name, the largest first: those of splatting data sets."""
 
 _OTHER = re.compile(r"depth|mask|semantic|label|normal|confidence", re.IGNORECASE)  # folders of no images
-_MOST_FILES = 1_000_000
+_MAX_FILES = 1_000_000
 _LONGEST_NAME = 255  # bytes
 _GIVE = "Give the folder of the images with --images."
 
@@ -90,7 +90,7 @@ def find_images(root: Path, named: Sequence[tuple[Any, str]]) -> Found:
         )
     absent = {row: direct[row] or root / path_parts(named[row][0])[-1] for row in lost if files[row] is None}
     every = tuple(file or absent[row] for row, file in enumerate(files))
-    return Found(every, frozenset(absent.values()), _said(root, named, every, [row for row in lost if files[row]]))
+    return Found(every, frozenset(absent.values()), _how_found(root, named, every, [row for row in lost if files[row]]))
 
 
 def count_there(folder: Path, names: Sequence[str]) -> int:
@@ -98,7 +98,7 @@ def count_there(folder: Path, names: Sequence[str]) -> int:
     paths = [path for name in names if (path := path_inside(folder, name)) is not None]
     if count := sum(path.is_file() for path in paths):
         return count
-    stems = {parent: {picture.stem for picture in list_images(parent)} for parent in {path.parent for path in paths}}
+    stems = {parent: {image.stem for image in list_images(parent)} for parent in {path.parent for path in paths}}
     return sum(path.stem in stems[path.parent] for path in paths)
 
 
@@ -116,8 +116,8 @@ def _by_tails(
                 f"{where}: names {str(name)[:60]!r}, which is not a file inside {tails.root}; write the image's path "
                 "there"
             )
-    least = 1 if len({path_parts(name)[:-1] for name, _ in named}) == 1 else 2
-    found = [tails.find(path_parts(name), least, name, where) for name, where in lost]
+    min_parts = 1 if len({path_parts(name)[:-1] for name, _ in named}) == 1 else 2
+    found = [tails.find(path_parts(name), min_parts, name, where) for name, where in lost]
     return [None if file in taken else file for file in found]
 
 
@@ -128,16 +128,17 @@ def _is_possible(root: Path, name: str) -> bool:
     return path_inside(root, longest) is not None
 
 
-def _said(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], moved: Sequence[int]) -> str:
+def _how_found(root: Path, named: Sequence[tuple[Any, str]], files: Sequence[Path], moved: Sequence[int]) -> str:
     """How images were found that are not where their names say."""
     ways: dict[str, list[int]] = {"by the ends of their paths": [], "by their names without suffix": []}
     for row in moved:
         name = path_parts(named[row][0])[-1]
         is_spelled = not _has_suffix(name) or PurePosixPath(name).suffix.lower() == files[row].suffix.lower()
         ways["by the ends of their paths" if is_spelled else "by their names without suffix"].append(row)
-    said = {way: (named[rows[0]][0][-60:], files[rows[0]].relative_to(root)) for way, rows in ways.items() if rows}
+    examples = {way: (named[rows[0]][0][-60:], files[rows[0]].relative_to(root)) for way, rows in ways.items() if rows}
     return "; ".join(
-        f"{len(ways[way])} of {len(named)} {way}: {name!r} is {place.as_posix()}" for way, (name, place) in said.items()
+        f"{len(ways[way])} of {len(named)} {way}: {name!r} is {place.as_posix()}"
+        for way, (name, place) in examples.items()
     )
 
 
@@ -188,8 +189,8 @@ class _Tails:
         inside = self.root.resolve()
         for at, (folder, folders, names) in enumerate(os.walk(self.root)):
             folders[:] = sorted(name for name in folders if not name.startswith("."))
-            if at + len(known) > _MOST_FILES:
-                raise InputError(f"{self.root}: has more than {_MOST_FILES} files and folders below. {_GIVE}")
+            if at + len(known) > _MAX_FILES:
+                raise InputError(f"{self.root}: has more than {_MAX_FILES} files and folders below. {_GIVE}")
             for name in names:
                 file = Path(folder, name)
                 if file.suffix.lower() in IMAGE_SUFFIXES and (
@@ -198,7 +199,7 @@ class _Tails:
                     known[_folded(file.stem)].append(file.relative_to(self.root).parts)
         return known
 
-    def find(self, parts: Parts, least: int, name: str, where: str) -> Path | None:
+    def find(self, parts: Parts, min_parts: int, name: str, where: str) -> Path | None:
         """The image with the longest common end, of so many parts at least.
 
         Raises:
@@ -213,7 +214,7 @@ class _Tails:
             length, is_named = 1 + _common(known[:-1], folders), _folded(known[-1]) in folded
             if length == 1 and len(known) > 1 and (not is_named or _OTHER.search(known[-2])):
                 continue
-            if length >= least:
+            if length >= min_parts:
                 found[length, is_named].append(known)
         if not found:
             return None

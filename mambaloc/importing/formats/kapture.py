@@ -21,7 +21,7 @@ from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
 from mambaloc.importing.formats.builder import Checked, Matrices, Posed, build_capture, from_quaternions
 from mambaloc.importing.formats.finding import find_images
-from mambaloc.importing.formats.kapture_cameras import UNKNOWN, told_cameras
+from mambaloc.importing.formats.kapture_cameras import UNKNOWN, unique_cameras
 from mambaloc.importing.formats.parsing import as_numbers, folder_name, images_in_same_folders, read_text
 from mambaloc.importing.formats.timing import stamps_of
 
@@ -29,7 +29,7 @@ SPLITS: Mapping[str, Split] = {"mapping": "train", "validation": "val", "query":
 """What frames are for, by the name of their kapture's folder, or of the first folder of their path."""
 
 _FIRST_LINE = "# kapture format:"
-_MOST_RIGS = 8  # one on another
+_MAX_RIGS = 8  # one on another
 _SINCE_1970_S = (5e8, 5e9)  # from 1985 to 2128: other numbers may be counters
 _CHOICES = {
     "axes": "OpenCV camera axes, as COLMAP has them",
@@ -91,12 +91,12 @@ def read_kapture(source: Path, images: Path | None = None) -> Capture:
             device = checked[record.row]
             world_from_cam = np.linalg.inv(record.sensor_from_device @ device.world_from_cam).astype(np.float64)
             pose = replace(device, world_from_cam=world_from_cam)
-            told = Posed(file, _sequence(file, root), pose, split=record.split)
-            frames.append((record.key, told, _told(sensors, record)))
+            posed_image = Posed(file, _sequence(file, root), pose, split=record.split)
+            frames.append((record.key, posed_image, _sensor_of(sensors, record)))
         choices |= {**found.choices, **checked.choices}
     if len({key for key, _, _ in frames}) == len(frames):  # parts of one recording; others may count alike
         frames.sort(key=lambda frame: frame[0])
-    names, cameras = told_cameras([lens for _, _, lens in frames])
+    names, cameras = unique_cameras([lens for _, _, lens in frames])
     times_s = _times_s([str(stamp) for (stamp, _), _, _ in frames])
     if None in names and any(names):
         choices["cameras"] = f"none: some images are of an {UNKNOWN}"
@@ -173,8 +173,8 @@ def _records(part: Path, split: Split | None) -> tuple[Checked, list[_Record]]:
     for where, (stamp, device, name) in _rows(sensors / "records_camera.txt", ("timestamp", "sensor", "image")):
         key = _key(stamp, device, where)
         row, sensor_from_device = _device(key, row_of, rigs)
-        told = split or SPLITS.get(PurePosixPath(name.replace("\\", "/")).parts[0] if name else "")
-        records.append(_Record(key, name, where, told, row, sensor_from_device))
+        image_split = split or SPLITS.get(PurePosixPath(name.replace("\\", "/")).parts[0] if name else "")
+        records.append(_Record(key, name, where, image_split, row, sensor_from_device))
     if not records:
         raise InputError(f"{sensors / 'records_camera.txt'}: names no image; add rows 'timestamp, sensor, image'")
     return checked, records
@@ -203,24 +203,24 @@ def _device(
     """The row of the pose of a sensor, or else of the nearest rig that carries it, and what leads from that to it."""
     stamp, sensor = key
     reached = [(sensor, np.eye(4))]
-    for _ in range(_MOST_RIGS):
+    for _ in range(_MAX_RIGS):
         for device, sensor_from_device in reached:
             if (stamp, device) in row_of:
                 return row_of[stamp, device], sensor_from_device
         reached = [
             (rig, sensor_from_device @ device_from_rig)
-            for device, sensor_from_device in reached[:_MOST_RIGS]
+            for device, sensor_from_device in reached[:_MAX_RIGS]
             for rig, device_from_rig in rigs.get(device, ())
         ]
     return None, np.eye(4)
 
 
-def _told(sensors: Mapping[str, tuple[str, ...]], record: _Record) -> tuple[str, ...] | None:
+def _sensor_of(sensors: Mapping[str, tuple[str, ...]], record: _Record) -> tuple[str, ...] | None:
     """Where an image's camera is, its model and its numbers; None for one that is not calibrated."""
-    told = sensors.get(record.key[1])
-    if told is None:
+    sensor = sensors.get(record.key[1])
+    if sensor is None:
         raise InputError(f"{record.where}: sensor {record.key[1][:40]!r} is not a camera of sensors.txt; add it there")
-    return None if told[1:2] == (UNKNOWN,) else told
+    return None if sensor[1:2] == (UNKNOWN,) else sensor
 
 
 def _times_s(stamps: Sequence[str]) -> list[float | None]:

@@ -29,7 +29,7 @@ _COEFFICIENTS = {
 }
 
 
-def told_cameras(lenses: Sequence[tuple[str, ...] | None]) -> tuple[list[str | None], dict[str, Camera]]:
+def unique_cameras(lenses: Sequence[tuple[str, ...] | None]) -> tuple[list[str | None], dict[str, Camera]]:
     """The name of each image's camera, and cameras by name; both are empty if an image has no camera.
 
     Args:
@@ -43,17 +43,17 @@ def told_cameras(lenses: Sequence[tuple[str, ...] | None]) -> tuple[list[str | N
     if None in names:
         return names, {}
     places = {each[1:]: each[0] for each in lenses if each is not None}
-    return names, {name: _camera(told, places[told]) for told, name in numbers.items()}
+    return names, {name: _camera(params, places[params]) for params, name in numbers.items()}
 
 
-def _camera(told: tuple[str, ...], where: str) -> Camera:
-    model = told[0] if told else ""
+def _camera(params: tuple[str, ...], where: str) -> Camera:
+    model = params[0] if params else ""
     if model not in _COEFFICIENTS:
         raise InputError(
             f"{where}: camera model {model[:40]!r} is not read, only {', '.join(_COEFFICIENTS)}; export undistorted "
             "images"
         )
-    values = as_numbers(told[1:])
+    values = as_numbers(params[1:])
     focals, count = _FOCALS.get(model, 2), _COEFFICIENTS[model]
     if values is None or len(values) != 4 + focals + count or not np.isfinite(values).all():
         raise InputError(f"{where}: {model} must have {4 + focals + count} finite numbers; correct it")

@@ -69,16 +69,16 @@ def _concern(found: Mapping[int, str], unknown: Sequence[str], names: Sequence[A
 
 
 def _with_test(found: dict[int, str], unknown: Sequence[str], twice: int) -> Given:
-    said = []
+    notes = []
     if "val" in found.values() and "test" not in found.values():
         found = {row: "test" if split == "val" else split for row, split in found.items()}
-        said.append("the validation frames are the test split, since the capture lists no test frames")
+        notes.append("the validation frames are the test split, since the capture lists no test frames")
     if twice:
-        said.append(f"{twice} names are in more than one list: such frames are not trained on")
+        notes.append(f"{twice} names are in more than one list: such frames are not trained on")
     if unknown:
         more = ", ..." if len(unknown) > _SHOWN else ""
-        said.append(f"{len(unknown)} listed names are of no frame, or of several: {', '.join(unknown[:_SHOWN])}{more}")
-    return Given(found, {"split": "; ".join(said)} if said else {})
+        notes.append(f"{len(unknown)} listed names are of no frame, or of several: {', '.join(unknown[:_SHOWN])}{more}")
+    return Given(found, {"split": "; ".join(notes)} if notes else {})
 
 
 def _row(parts: tuple[str, ...], rows_of: Mapping[tuple[str, ...], list[int]], names: Sequence[Any]) -> int | None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.arkit import told_apart
+from mambaloc.importing.formats.arkit import distinguish_cameras
 from mambaloc.importing.formats.builder import Posed, build_capture, from_quaternions, pinhole
 from mambaloc.importing.formats.finding import find_images
 from mambaloc.importing.formats.parsing import as_numbers, folder_name, images_in_same_folders, read_lines, read_table
@@ -61,7 +61,7 @@ def read_map_free(source: Path, images: Path | None = None) -> Capture:
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     lenses = cameras_by_image(source / _INTRINSICS)
     has_lens = all(table.words[row] in lenses for row in there)
-    names, cameras = told_apart([lenses[table.words[row]] for row in there] if has_lens else [])
+    names, cameras = distinguish_cameras([lenses[table.words[row]] for row in there] if has_lens else [])
     camera_of: Sequence[str | None] = names or [None] * len(there)
     posed = [
         Posed(

@@ -49,14 +49,14 @@ def read_metashape(source: Path, images: Path | None = None) -> Capture:
         InputError: for a file that is malformed, a camera that cannot be one, or where no image is there.
     """
     path = only_file(_files(source), source)
-    chunk, said = _largest_chunk(path)
+    chunk, not_read = _largest_chunk(path)
     aligned = [camera for camera in chunk.iterfind("cameras//camera") if camera.find("transform") is not None]
     if not aligned:
         raise InputError(f"{path}: no camera is aligned; align the photos, and export the cameras again")
     component, count = Counter(camera.get("component_id") for camera in aligned).most_common(1)[0]
     cameras = [camera for camera in aligned if camera.get("component_id") == component]
     if len(aligned) > count:
-        said.append(f"{len(aligned) - count} cameras of other components, which were aligned apart")
+        not_read.append(f"{len(aligned) - count} cameras of other components, which were aligned apart")
     labels = [camera.get("label") or "" for camera in cameras]
     folder = images or path.parent
     found = find_images(folder, [(label, f"{path}: camera {label[:60]!r}") for label in labels])
@@ -89,7 +89,7 @@ def read_metashape(source: Path, images: Path | None = None) -> Capture:
             "direction": "camera-to-chunk, as the format has it, and the chunk's transform to the world",
             "scale": "metres, by the chunk's references" if is_metric else "unknown: the chunk has no references",
             "origin": "kept",
-            **({"not read": "; ".join(said)} if said else {}),
+            **({"not read": "; ".join(not_read)} if not_read else {}),
             **found.choices,
             **checked.choices,
         },
@@ -140,10 +140,10 @@ def _to_chunk(path: Path, cameras: Sequence[Element]) -> tuple[Matrices, dict[in
 
 def _to_world(path: Path, transform: Element, poses: Matrices) -> Matrices:
     """Poses in a chunk as ``world_from_cam``."""
-    told = [_numbers(transform, name) for name in ("rotation", "translation", "scale")]
-    rotation, translation, scale = (np.zeros(0) if each is None else each for each in told)
-    is_whole = (len(rotation), len(translation), len(scale)) == (9, 3, 1)
-    if not is_whole or not np.isfinite([*translation, *scale]).all() or not 1e-9 < scale[0] < 1e9:
+    parts = [_numbers(transform, name) for name in ("rotation", "translation", "scale")]
+    rotation, translation, scale = (np.zeros(0) if each is None else each for each in parts)
+    is_complete = (len(rotation), len(translation), len(scale)) == (9, 3, 1)
+    if not is_complete or not np.isfinite([*translation, *scale]).all() or not 1e-9 < scale[0] < 1e9:
         raise InputError(f"{path}: the chunk's transform is not a rotation, translation and scale; export it again")
     matrix = np.c_[rotation.reshape(3, 3), translation]
     (turned,) = validate_se3(matrix[None], lambda _: f"{path}: the chunk's transform").poses
@@ -180,17 +180,17 @@ def _sensor(path: Path, chunk: Element, number: str) -> Camera:
     kind = calibration.get("type") or sensor.get("type") or "frame"
     if kind not in ("frame", *_FISHEYES):
         raise InputError(f"{where}: is {kind[:40]!r}, not a frame or fisheye camera; export undistorted photos")
-    told = {}
+    params = {}
     for name in ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"):
         values = _numbers(calibration, name) if calibration.find(name) is not None else np.zeros(1)
         if values is None or len(values) != 1 or not abs(values[0]) < 1e9:
             raise InputError(f"{where}: {name} is not a number; export the cameras again")
-        told[name] = float(values[0])
+        params[name] = float(values[0])
     size = _size(calibration.find("resolution"), sensor.find("resolution"))
-    focal, affinity = told["f"], (told["b1"], told["b2"])
-    center = [side / 2 + told[name] - CORNER_PX for side, name in zip(size, ("cx", "cy"), strict=True)]
+    focal, affinity = params["f"], (params["b1"], params["b2"])
+    center = [side / 2 + params[name] - CORNER_PX for side, name in zip(size, ("cx", "cy"), strict=True)]
     camera = pinhole(size, (focal + affinity[0], focal), center, where)
-    radial, tangential = ([told[f"{letter}{n}"] for n in (1, 2, 3, 4)] for letter in "kp")
+    radial, tangential = ([params[f"{letter}{n}"] for n in (1, 2, 3, 4)] for letter in "kp")
     is_fisheye = kind in _FISHEYES
     if not any((*radial, *tangential, affinity[1], is_fisheye)):
         return camera

@@ -236,9 +236,9 @@ def _how_written(content: dict[str, Any]) -> dict[str, str]:
     """What was decided of matrices that are not written in rows."""
     matrices = (frame.get("transform_matrix") for frame in _all_frames(content))
     in_one_list = sum(isinstance(each, list) and len(each) in (12, 16) for each in matrices)
-    said = [f"{in_one_list} in one list of numbers"] if in_one_list else []
-    said += ["written column after column: only so are they rotations"] if _is_by_column(content) else []
-    return {"matrices": "; ".join(said)} if said else {}
+    notes = [f"{in_one_list} in one list of numbers"] if in_one_list else []
+    notes += ["written column after column: only so are they rotations"] if _is_by_column(content) else []
+    return {"matrices": "; ".join(notes)} if notes else {}
 
 
 def _numbers(matrix: Any) -> Matrices | None:

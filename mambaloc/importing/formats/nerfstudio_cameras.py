@@ -24,7 +24,7 @@ KEYS = (
 """What a file, or a frame of it, says of a camera."""
 
 _BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
-_MOST_FOCAL_PX = 1e7
+_MAX_FOCAL_PX = 1e7
 
 
 def read_cameras(
@@ -59,16 +59,16 @@ def read_cameras(
         )
         for key, rows in frames.items()
     }
-    return cameras, [names[key] for key in keys], _said(cameras)
+    return cameras, [names[key] for key in keys], _summary(cameras)
 
 
-def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
+def number(content: Mapping[str, Any], key: str, where: str) -> float | None:
     """A finite number, or None without one.
 
     Raises:
         InputError: for anything else.
     """
-    value = told.get(key)
+    value = content.get(key)
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
@@ -76,29 +76,29 @@ def number(told: Mapping[str, Any], key: str, where: str) -> float | None:
     return float(value)
 
 
-def _camera(told: Mapping[str, Any], images: Sequence[Path], where: str) -> Camera:
+def _camera(content: Mapping[str, Any], images: Sequence[Path], where: str) -> Camera:
     """A camera in pixels of the size in the file, or else of the first of its own images."""
-    size = [number(told, key, where) for key in "wh"]
+    size = [number(content, key, where) for key in "wh"]
     sides = [side for side in size if side] if all(size) else list(map(float, first_size(images)))
-    focal = [_focal(told, axis, sides[axis], where) for axis in (0, 1)]
+    focal = [_focal(content, axis, sides[axis], where) for axis in (0, 1)]
     focal_px = (focal[0], focal[1]) if focal[0] and focal[1] else (focal[0] or focal[1],) * 2
-    center = [number(told, key, where) for key in ("cx", "cy")]
+    center = [number(content, key, where) for key in ("cx", "cy")]
     center_px = [side / 2 if at is None else at for at, side in zip(center, sides, strict=True)]
-    if not all(1 <= side <= LARGEST_SIDE_PX for side in sides) or not all(0 < f < _MOST_FOCAL_PX for f in focal_px):
+    if not all(1 <= side <= LARGEST_SIDE_PX for side in sides) or not all(0 < f < _MAX_FOCAL_PX for f in focal_px):
         raise InputError(f"{where}: {sides[0]:g}x{sides[1]:g} pixels, focal length {focal_px[0]:g}: correct it")
     if not all(-side < at < 2 * side for at, side in zip(center_px, sides, strict=True)):
         raise InputError(f"{where}: its centre {center_px} is far outside the image; correct it")
     camera = Camera(round(sides[0]), round(sides[1]), focal_px, (center_px[0] - CORNER_PX, center_px[1] - CORNER_PX))
-    return _with_lens(camera, told, where)
+    return _with_lens(camera, content, where)
 
 
-def _focal(told: Mapping[str, Any], axis: int, side: float, where: str) -> float:
+def _focal(content: Mapping[str, Any], axis: int, side: float, where: str) -> float:
     """Focal length along an axis in pixels, from the angle of view where that is given instead; 0 where neither is."""
     key = "xy"[axis]
-    if focal_px := number(told, f"fl_{key}", where):
+    if focal_px := number(content, f"fl_{key}", where):
         return focal_px
     # Of an angle beside a focal length instant-ngp says only the same again.
-    angle_rad = number(told, f"camera_angle_{key}", where) if told.get("fl_x") is None else None
+    angle_rad = number(content, f"camera_angle_{key}", where) if content.get("fl_x") is None else None
     if angle_rad is None:
         return 0.0
     if not 0 < angle_rad < math.pi:
@@ -106,11 +106,11 @@ def _focal(told: Mapping[str, Any], axis: int, side: float, where: str) -> float
     return side / 2 / math.tan(angle_rad / 2)
 
 
-def _with_lens(camera: Camera, told: Mapping[str, Any], where: str) -> Camera:
-    coefficients = [number(told, key, where) or 0.0 for key in _COEFFICIENTS]
+def _with_lens(camera: Camera, content: Mapping[str, Any], where: str) -> Camera:
+    coefficients = [number(content, key, where) or 0.0 for key in _COEFFICIENTS]
     k1, k2, k3, k4, p1, p2 = coefficients
-    is_fisheye = bool(told.get("is_fisheye"))
-    model = told.get("camera_model") or (
+    is_fisheye = bool(content.get("is_fisheye"))
+    model = content.get("camera_model") or (
         "OPENCV_FISHEYE" if is_fisheye else "OPENCV" if any(coefficients) else "PINHOLE"
     )
     if model == "OPENCV_FISHEYE":
@@ -146,6 +146,6 @@ def first_size(images: Sequence[Path]) -> tuple[int, int]:
     raise InputError(f"{reasons[0]} (neither it nor any other of {len(images)} images can be decoded)")
 
 
-def _said(cameras: Mapping[str, Camera]) -> str:
+def _summary(cameras: Mapping[str, Camera]) -> str:
     first = next(iter(cameras.values()))
     return f"{len(cameras)}, {first.model}; the centre of the top-left pixel was (0.5, 0.5), and is (0, 0)"

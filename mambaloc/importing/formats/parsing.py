@@ -18,7 +18,7 @@ from mambaloc.files import path_inside, read_json
 from mambaloc.images import IMAGE_SUFFIXES, has_images, list_images
 from mambaloc.text import decode_text
 
-_MOST_BYTES = 1 << 26  # of a text: poses of a million images
+_MAX_BYTES = 1 << 26  # of a text: poses of a million images
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def read_text(path: Path, holds: str) -> str:
     try:
         if not path.is_file():
             raise InputError(f"{path}: missing; it holds {holds}")
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB; give a text that holds {holds}")
+        if path.stat().st_size > _MAX_BYTES:
+            raise InputError(f"{path}: is larger than {_MAX_BYTES >> 20} MiB; give a text that holds {holds}")
         return decode_text(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); it holds {holds}") from None
@@ -178,7 +178,7 @@ def inside(folder: Path, name: Any, where: str) -> Path:
 
 def images_in_same_folders(images: Iterable[Path]) -> list[Path]:
     """All images in the folders that images are in, as :func:`list_images`."""
-    return [picture for folder in dict.fromkeys(image.parent for image in images) for picture in list_images(folder)]
+    return [sibling for folder in dict.fromkeys(image.parent for image in images) for sibling in list_images(folder)]
 
 
 def first_with_images(folders: Sequence[Path]) -> Path:

@@ -19,7 +19,7 @@ from mambaloc.data.depth_frames import INTRINSICS_FILE, depth_path, read_depth_i
 from mambaloc.errors import InputError
 from mambaloc.images import list_images, stored_size
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.arkit import told_apart
+from mambaloc.importing.formats.arkit import distinguish_cameras
 from mambaloc.importing.formats.builder import Checked, Matrices, Posed, build_capture, pinhole, validate_se3
 from mambaloc.importing.formats.calibration_files import calibrated
 from mambaloc.importing.formats.parsing import as_numbers, folder_name, number_of, read_text
@@ -34,7 +34,7 @@ _KIND = r"(?:colou?r|rgb|image|img|poses?|camera_pose|cam2world|extrinsics?)"
 _MARKED = re.compile(rf"{_KIND}[._-]?(?=\d)|[._-]{_KIND}$", re.IGNORECASE)
 _OTHER = re.compile(r"depth|mask|semantic|label|normal|confidence", re.IGNORECASE)
 _DEEPEST = 3  # folders below the source
-_MOST_FOLDERS = 1000
+_MAX_FOLDERS = 1000
 _SAMPLED = 20
 _SPLITS = ("train", "val", "test")
 _OFFICIAL_SIZE, _OFFICIAL_FOCAL_PX = (640, 480), 525.0  # of 7-Scenes' colour camera
@@ -85,7 +85,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
     checked = towards_world(checked, direction)
     is_layout = all(file.name.endswith(".pose.txt") for file in files)
     images = [(group.name, image) for group in groups for image, _ in group.pairs]
-    names, cameras, said = _cameras(source, [image for _, image in images], is_layout)
+    names, cameras, camera_choice = _cameras(source, [image for _, image in images], is_layout)
     depth, depth_camera = _depth(source, [image for _, image in images]) if is_layout else ([None] * len(images), None)
     posed = [
         Posed(
@@ -98,7 +98,10 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
         )
         for row, ((name, image), camera, each) in enumerate(zip(images, names, depth, strict=True))
     ]
-    told = {**({"written": "column after column"} if by_column else {}), **({"cameras": said} if said else {})}
+    choices = {
+        **({"written": "column after column"} if by_column else {}),
+        **({"cameras": camera_choice} if camera_choice else {}),
+    }
     unit = "metres, as 7-Scenes has them" if is_layout else "unknown: pose files do not state it"
     return build_capture(
         "pose_files",
@@ -111,7 +114,7 @@ def read_pose_files(source: Path, direction: Direction = "world_from_cam") -> Ca
             "scale": unit,
             "origin": "kept",
             "association": "each image with the file of its name",
-            **told,
+            **choices,
             **checked.choices,
         },
         cameras=cameras,
@@ -144,7 +147,7 @@ def _folders(source: Path) -> Iterator[Path]:
         yield from level
         found += len(level)
         level = sorted((below for each in level for below in each.iterdir() if below.is_dir()), key=natural)
-        if found + len(level) > _MOST_FOLDERS:
+        if found + len(level) > _MAX_FOLDERS:
             return
 
 
@@ -228,12 +231,14 @@ def _read_matrices(files: list[Path]) -> tuple[Checked, bool]:
 
 def _cameras(source: Path, images: list[Path], is_layout: bool) -> tuple[Sequence[str | None], dict[str, Camera], str]:
     """The name of each image's camera, cameras by name, and what was decided: by files, or that of 7-Scenes."""
-    found, said = calibrated(source, images)
+    found, camera_choice = calibrated(source, images)
     if found:
-        return *told_apart([found[image] for image in images]), said
+        return *distinguish_cameras([found[image] for image in images]), camera_choice
     official = _official_camera(images[0]) if is_layout else None
     return (
-        ([None] * len(images), {}, said) if official is None else (["colour"] * len(images), {"colour": official}, "")
+        ([None] * len(images), {}, camera_choice)
+        if official is None
+        else (["colour"] * len(images), {"colour": official}, "")
     )
 
 
@@ -249,10 +254,12 @@ def _depth(source: Path, images: list[Path]) -> tuple[list[Path | None], Matrice
     """Depth frames of images and their camera, where a file has it or it is the official sensor's."""
     files = [path if (path := depth_path(image)).is_file() else None for image in images]
     first = next((path for path in files if path is not None), None)
-    told = next((path for path in (source, source.resolve().parent) if (path / INTRINSICS_FILE).is_file()), None)
+    with_intrinsics = next(
+        (path for path in (source, source.resolve().parent) if (path / INTRINSICS_FILE).is_file()), None
+    )
     if first is None:
         return files, None
     height, width = read_depth_mm(first).shape
-    if told is None and (width, height) != _OFFICIAL_SIZE:
+    if with_intrinsics is None and (width, height) != _OFFICIAL_SIZE:
         return [None] * len(images), None
-    return files, read_depth_intrinsics(told or source, (width, height))
+    return files, read_depth_intrinsics(with_intrinsics or source, (width, height))

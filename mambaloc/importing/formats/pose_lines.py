@@ -126,12 +126,12 @@ def _files(source: Path) -> dict[Path, Layout]:
 def _read_named(path: Path, layout: Layout, direction: Direction | None, given: Path | None) -> Capture:
     table = read_rows(path, layout, f"name and {layout.count} numbers")
     if layout.count == 7:
-        checked, direction, told = _of_sevens(table, layout, direction)
+        checked, direction, choices = _of_sevens(table, layout, direction)
     else:
         direction = direction or "world_from_cam"
         checked = validate_se3(matrices_of(table.numbers, layout.by_column), table.where)
-        told = {"direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD}
-        told |= _by_column(layout)
+        choices = {"direction": _WORLD_FROM_CAM if direction == "world_from_cam" else _CAM_FROM_WORLD}
+        choices |= _by_column(layout)
     checked = towards_world(checked, direction)
     rows, how, missing = _images_of(path, table, given)
     cameras = cameras_by_image(path.parent / "intrinsics.txt")
@@ -155,7 +155,7 @@ def _read_named(path: Path, layout: Layout, direction: Direction | None, given: 
         unit="unknown",
         choices={
             **_CHOICES,
-            **told,
+            **choices,
             "scale": scale_of(length_m, _CHOICES["scale"]),
             "association": how,
             **checked.choices,
@@ -184,8 +184,8 @@ def _of_sevens(table: Table, layout: Layout, direction: Direction | None) -> tup
         quaternion = np.roll(quaternion, 1, axis=1)
     checked = from_quaternions(position, quaternion, table.where)
     direction = direction or ("cam_from_world" if comes_first else "world_from_cam")
-    told = {"direction": f"{_WORLD_FROM_CAM if direction == 'world_from_cam' else _CAM_FROM_WORLD}, scalar {scalar}"}
-    return checked, direction, told
+    choices = {"direction": f"{_WORLD_FROM_CAM if direction == 'world_from_cam' else _CAM_FROM_WORLD}, scalar {scalar}"}
+    return checked, direction, choices
 
 
 def towards_world(checked: Checked, direction: Direction) -> Checked:

@@ -25,10 +25,10 @@ SUFFIXES = ("", ".txt", ".tum", ".kitti", ".log", ".dat", ".tsv")
 IMAGE_FOLDERS = ("rgb", "color", "image_2", "image_0", "images", "image", "frames", "results", "data", ".")
 """Where images lie beside a file of poses."""
 _LOOKED_AT = 200  # lines
-_LEAST_LINES = 2  # one may be a camera's place on its rig
-_MOST_FILES = 64  # of a folder: more are labels of images
+_MIN_LINES = 2  # one may be a camera's place on its rig
+_MAX_FILES = 64  # of a folder: more are labels of images
 _NEARLY_ALL = 0.9  # of the lines: others may be damaged, and are refused by their line
-_MOST = 0.8
+_MAJORITY = 0.8
 _TOLERANCE = 0.02  # of lengths and of entries of R R^T
 _HEADERS = 3
 _AFTER_IMAGE = re.compile(rf"(.*?(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))}))[\s,;]+(.+)", re.IGNORECASE)
@@ -105,11 +105,11 @@ def layout_of(path: Path) -> Layout | None:
     except InputError:
         return None
     first, rest = lines[:_LOOKED_AT], lines[_LOOKED_AT:]  # trackers may have no pose for long
-    said = [line.strip() for line in (*first, *rest[:: 1 + len(rest) // _LOOKED_AT]) if line.strip()]
-    headers = [columns_in(line.lstrip("#% ")) for line in said if line.startswith("#")]
-    rows = [split_line(line) for line in said if not line.startswith("#")]
+    sample = [line.strip() for line in (*first, *rest[:: 1 + len(rest) // _LOOKED_AT]) if line.strip()]
+    headers = [columns_in(line.lstrip("#% ")) for line in sample if line.startswith("#")]
+    rows = [split_line(line) for line in sample if not line.startswith("#")]
     start = next((at for at, (_, words) in enumerate(rows[: _HEADERS + 1]) if as_numbers(words[-7:]) is not None), None)
-    if start is None or len(rows) - start < _LEAST_LINES:
+    if start is None or len(rows) - start < _MIN_LINES:
         return None
     if start > 0:
         headers.append(columns_in(" ".join((rows[start - 1][0], *rows[start - 1][1]))))
@@ -150,7 +150,7 @@ def _have_one_length(length: Matrices) -> bool:
     """Whether most quaternions have the usual length, and nearly all may be made units."""
     usual = float(np.median(length)) if len(length) else 0.0
     are_usual, may_be = np.abs(length - usual) < _TOLERANCE * usual, (length >= SHORTEST) & (length <= LONGEST)
-    return len(length) > 0 and bool(are_usual.mean() >= _MOST and may_be.mean() >= _NEARLY_ALL)
+    return len(length) > 0 and bool(are_usual.mean() >= _MAJORITY and may_be.mean() >= _NEARLY_ALL)
 
 
 def _lengths(table: Matrices, place: int) -> Matrices:
@@ -185,13 +185,13 @@ def pose_files(folder: Path) -> dict[Path, Layout]:
     """The files of a folder whose lines are poses; none that has an image's name, which it labels."""
     if not folder.is_dir():
         return {}
-    pictured = {picture.name.partition(".")[0] for picture in list_images(folder)}
+    pictured = {image.name.partition(".")[0] for image in list_images(folder)}
     texts = [
         path
         for path in sorted(folder.iterdir())
         if path.suffix.lower() in SUFFIXES and path.name.partition(".")[0] not in pictured and path.is_file()
     ]
-    if len(texts) > _MOST_FILES:
+    if len(texts) > _MAX_FILES:
         return {}
     return {path: layout for path in texts if (layout := layout_of(path)) is not None}
 

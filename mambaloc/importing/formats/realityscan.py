@@ -36,7 +36,7 @@ _POSE = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 _LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 """Columns that may be missing from an export; they are then zeros."""
 _NEWER = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
-_FILM_MM = 36.0
+_FULL_FRAME_MM = 36.0
 _BEFORE_HEADER = 5  # lines, as the number of cameras
 _CHOICES = {
     "axes": "OpenGL's (x right, y up, z back), turned to OpenCV's; angles turn about z, x and y",
@@ -72,12 +72,12 @@ def read_realityscan(source: Path, images: Path | None = None) -> Capture:
     there = [row for row, file in enumerate(found.files) if file not in found.missing]
     table = np.array([numbers for _, _, numbers in rows])
     checked = validate_se3(_world_from_cam(table), lambda row: f"{path}, line {rows[row][0]}")
-    told: dict[tuple[float, ...], str] = {}
+    name_of: dict[tuple[float, ...], str] = {}
     cameras: dict[str, Camera] = {}
     posed = []
     for row, size in zip(there, _sizes([found.files[row] for row in there]), strict=True):
         lens = (*size, *table[row, len(_POSE) - 1 :].tolist())
-        name = told.setdefault(lens, f"camera-{len(told) + 1}")
+        name = name_of.setdefault(lens, f"camera-{len(name_of) + 1}")
         if name not in cameras:
             cameras[name] = _camera(size, lens[2:], f"{path}, line {rows[row][0]}")
         posed.append(Posed(found.files[row], _sequence(found.files[row], folder), checked[row], name))
@@ -172,7 +172,7 @@ def _camera(size: tuple[int, int], numbers: Sequence[float], where: str) -> Came
     """The camera of a row's f and lens."""
     focal, px, py, *radial, t1, t2 = numbers
     longer = max(size)
-    focal_px = focal / _FILM_MM * longer
+    focal_px = focal / _FULL_FRAME_MM * longer
     center = [side / 2 + share * longer - CORNER_PX for side, share in zip(size, (px, py), strict=True)]
     camera = pinhole(size, (focal_px, focal_px), center, where)
     if not np.isfinite([*radial, t1, t2]).all():

@@ -35,7 +35,7 @@ from mambaloc.importing.video import digest_of
 from mambaloc.runtime.camera_models import FisheyeModel, OpenCVModel
 from mambaloc.runtime.sources import SourceFrame
 from mambaloc.runtime.undistortion import undistorted
-from mambaloc.user_cache import made_once
+from mambaloc.user_cache import cached_folder
 
 _VERSION = 1  # of what is kept; another one is made again
 _NOTE, _POSES = "note.json", "poses.npy"
@@ -58,7 +58,7 @@ class BagTopics:
         pose_frame: the frame that the poses are of, where their messages do not say it.
     """
 
-    pictures: str | None = None
+    images: str | None = None
     poses: str | None = None
     pose_frame: str | None = None
 
@@ -76,14 +76,14 @@ def read_ros_bag(source: Path, topics: BagTopics | None = None) -> Capture:
     """
     asked = topics or BagTopics()
     with open_bag(source) as bag:
-        topic = image_topic(bag, asked.pictures)
-        told = camera_of(bag, topic)
+        topic = image_topic(bag, asked.images)
+        camera_info = camera_of(bag, topic)
         digest = digest_of(_files(source), _VERSION, topic, asked.poses, asked.pose_frame)
-        folder = made_once(f"bags/{digest}", lambda partial: _write_chosen(bag, topic, asked, partial))
+        folder = cached_folder(f"bags/{digest}", lambda partial: _write_chosen(bag, topic, asked, partial))
     note, poses = json.loads((folder / _NOTE).read_text(encoding="utf-8")), np.load(folder / _POSES)
     if note["gaps"]:
         warnings.warn(f"{source}: {note['gaps']}.", InputWarning, stacklevel=2)
-    cameras = {} if told is None else {"camera": camera_from(told, f"{source}: CameraInfo of {topic}")}
+    cameras = {} if camera_info is None else {"camera": camera_from(camera_info, f"{source}: CameraInfo of {topic}")}
     sequence = folder_name(source) if source.is_dir() else source.stem
     frames = sorted(zip(note["frames"], poses, strict=True), key=lambda frame: frame[0]["ns"])
     posed = [
@@ -109,41 +109,41 @@ def read_ros_bag(source: Path, topics: BagTopics | None = None) -> Capture:
     )
 
 
-def camera_from(told: BagCamera, where: str) -> Camera:
+def camera_from(camera_info: BagCamera, where: str) -> Camera:
     """A bag's camera with its lens.
 
     Args:
-        told: the camera of ``CameraInfo``.
+        camera_info: the camera of ``CameraInfo``.
         where: it is, for messages.
 
     Raises:
         InputError: for a distortion of no known model, or numbers that no lens has.
     """
-    (fx, fy), (cx, cy) = told.matrix[(0, 1), (0, 1)].tolist(), told.matrix[:2, 2].tolist()
-    camera = pinhole(told.size, (fx, fy), (cx, cy), where)
-    if not told.coefficients:
+    (fx, fy), (cx, cy) = camera_info.matrix[(0, 1), (0, 1)].tolist(), camera_info.matrix[:2, 2].tolist()
+    camera = pinhole(camera_info.size, (fx, fy), (cx, cy), where)
+    if not camera_info.coefficients:
         return camera
-    lens, counts = _LENSES.get(told.model, (OpenCVModel, ()))
-    if len(told.coefficients) not in counts:
+    lens, counts = _LENSES.get(camera_info.model, (OpenCVModel, ()))
+    if len(camera_info.coefficients) not in counts:
         raise InputError(
-            f"{where}: has the distortion model {told.model!r} with {len(told.coefficients)} coefficients, which is "
-            f"not read ({', '.join(_LENSES)}). Record a rectified topic."
+            f"{where}: has the distortion model {camera_info.model!r} with {len(camera_info.coefficients)} "
+            f"coefficients, which is not read ({', '.join(_LENSES)}). Record a rectified topic."
         )
-    distorted = lens(camera.focal_px, camera.center_px, told.coefficients)
-    return Camera(camera.width, camera.height, camera.focal_px, camera.center_px, distorted, told.model)
+    distorted = lens(camera.focal_px, camera.center_px, camera_info.coefficients)
+    return Camera(camera.width, camera.height, camera.focal_px, camera.center_px, distorted, camera_info.model)
 
 
-def straightener(told: BagCamera, size: tuple[int, int]) -> tuple[NDArray[np.float64], Callable[[Image], Image]]:
+def straightener(camera_info: BagCamera, size: tuple[int, int]) -> tuple[NDArray[np.float64], Callable[[Image], Image]]:
     """Intrinsics (3, 3) of a bag's images of a size as an import writes them, and what makes an image so.
 
     Raises:
         InputError: for images of another shape than the camera's, or as :func:`camera_from`.
     """
     name = "CameraInfo"
-    cameras = FittedCameras({name: camera_from(told, name)})
+    cameras = FittedCameras({name: camera_from(camera_info, name)})
     fit = cameras.fitted(name, size)
     if fit is None:
-        shapes = " and ".join("{}x{}".format(*each) for each in (size, told.size))
+        shapes = " and ".join("{}x{}".format(*each) for each in (size, camera_info.size))
         raise InputError(f"{name}: images and camera have other shapes ({shapes}). Give these with --intrinsics.")
     used, maps = cameras.as_used([name], [size], {size: size})[1][name], fit[1]
 
@@ -159,7 +159,7 @@ def _files(source: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class _PosedFrame(SourceFrame):
-    picture: BagImage
+    bag_image: BagImage
     pose: NDArray[np.float64]
 
 
@@ -172,23 +172,23 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
     def with_pose() -> Iterator[_PosedFrame]:
         seen = set()
         count, console = bag.counts[topic], Console(stderr=True)
-        for picture in track(images_of(bag, topic), "Choosing frames", count, console=console, transient=True):
-            pose = along(source.path, picture.ns)
+        for bag_image in track(images_of(bag, topic), "Choosing frames", count, console=console, transient=True):
+            pose = along(source.path, bag_image.ns)
             if isinstance(pose, Gap):
                 gaps.add(pose)
-            elif isinstance(picture.image, str):
-                damaged[f"{topic}, message {picture.number}"] = picture.image
-            elif picture.ns not in seen:  # else it was recorded twice
-                seen.add(picture.ns)
-                yield _PosedFrame(str(picture.number), picture.ns / 1e9, picture.image, picture, pose)
+            elif isinstance(bag_image.image, str):
+                damaged[f"{topic}, message {bag_image.number}"] = bag_image.image
+            elif bag_image.ns not in seen:  # else it was recorded twice
+                seen.add(bag_image.ns)
+                yield _PosedFrame(str(bag_image.number), bag_image.ns / 1e9, bag_image.image, bag_image, pose)
 
     frames, poses = [], []
     for frame in choose_frames(with_pose()):
         assert isinstance(frame, _PosedFrame)
-        data, suffix = _file_of(frame.picture)
-        name = f"{frame.picture.number:06d}{suffix}"
+        data, suffix = _file_of(frame.bag_image)
+        name = f"{frame.bag_image.number:06d}{suffix}"
         (folder / name).write_bytes(data)
-        frames.append({"name": name, "ns": frame.picture.ns})
+        frames.append({"name": name, "ns": frame.bag_image.ns})
         poses.append(frame.pose)
     if not frames:
         raise InputError(
@@ -200,7 +200,7 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
         "count": bag.counts[topic],
         "camera": camera,
         "world": source.world,
-        "chain": source.said,
+        "chain": source.chain,
         "poses": source.name,
         "gaps": str(gaps),
         "damaged": damaged,
@@ -208,10 +208,10 @@ def _write_chosen(bag: Bag, topic: str, asked: BagTopics, folder: Path) -> None:
     (folder / _NOTE).write_text(json.dumps(note), encoding="utf-8")
 
 
-def _file_of(picture: BagImage) -> tuple[bytes, str]:
+def _file_of(bag_image: BagImage) -> tuple[bytes, str]:
     """The image's file as it was recorded, or a PNG, and its suffix."""
     for start, suffix in ((b"\xff\xd8", ".jpg"), (b"\x89PNG", ".png")):
-        if picture.file is not None and picture.file.startswith(start):
-            return picture.file, suffix
-    image: Any = picture.image
+        if bag_image.file is not None and bag_image.file.startswith(start):
+            return bag_image.file, suffix
+    image: Any = bag_image.image
     return cv2.imencode(".png", image[..., ::-1])[1].tobytes(), ".png"

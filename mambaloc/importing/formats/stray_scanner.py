@@ -21,12 +21,12 @@ from mambaloc.data.depth_frames import read_depth_mm
 from mambaloc.errors import InputError
 from mambaloc.images import CORNER_PX, stored_size
 from mambaloc.importing.capture import Camera, Capture
-from mambaloc.importing.formats.arkit import told_apart
+from mambaloc.importing.formats.arkit import distinguish_cameras
 from mambaloc.importing.formats.builder import Matrices, Posed, build_capture, from_quaternions, pinhole
 from mambaloc.importing.formats.parsing import Table, as_numbers, folder_name, read_text
 from mambaloc.importing.video import chosen_as_stored
 
-_FILM, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
+_VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _SENSOR = ("depth", "confidence")
 _LENS = ("fx", "fy", "cx", "cy")
@@ -40,7 +40,7 @@ _CHOICES = {
 
 def is_stray_scanner(source: Path) -> bool:
     """Whether a folder is a recording of Stray Scanner."""
-    return all((source / name).is_file() for name in (_FILM, _ODOMETRY, _MATRIX))
+    return all((source / name).is_file() for name in (_VIDEO, _ODOMETRY, _MATRIX))
 
 
 def read_stray_scanner(source: Path) -> Capture:
@@ -53,17 +53,17 @@ def read_stray_scanner(source: Path) -> Capture:
     numbers = [_frame_number(table, row) for row in range(len(table.lines))]
     quaternion = table.numbers[:, [8, 5, 6, 7]]
     checked = from_quaternions(table.numbers[:, 2:5], quaternion, table.where)
-    film = chosen_as_stored(source / _FILM)
-    present = [row for row, number in enumerate(numbers) if number in film.images]
+    video = chosen_as_stored(source / _VIDEO)
+    present = [row for row, number in enumerate(numbers) if number in video.images]
     if not present:
         raise InputError(
-            f"{source / _ODOMETRY}: has no pose of a frame that was chosen of {_FILM}, which has {film.read} frames. "
+            f"{source / _ODOMETRY}: has no pose of a frame that was chosen of {_VIDEO}, which has {video.read} frames. "
             "Give the video and the poses of one recording."
         )
-    images = [film.images[numbers[row]] for row in present]
+    images = [video.images[numbers[row]] for row in present]
     size = stored_size(images[0])
     matrix = _camera_matrix(source / _MATRIX)
-    names, cameras = told_apart([_camera(table, row, size, matrix, source) for row in present])
+    names, cameras = distinguish_cameras([_camera(table, row, size, matrix, source) for row in present])
     depth, confidence = (_files_of(source / kind, [numbers[row] for row in present]) for kind in _SENSOR)
     posed = [
         Posed(
@@ -86,11 +86,11 @@ def read_stray_scanner(source: Path) -> Capture:
             **_CHOICES,
             **checked.choices,
             **_depth_choice(depth, confidence),
-            "frames": f"{len(film.images)} of {film.read}, by sharpness and movement",
+            "frames": f"{len(video.images)} of {video.read}, by sharpness and movement",
         },
         cameras=cameras,
-        missing=[f"{_FILM}, frame {number}" for number in numbers if number >= film.read],
-        beside=film.images.values(),
+        missing=[f"{_VIDEO}, frame {number}" for number in numbers if number >= video.read],
+        beside=video.images.values(),
         depth_camera=_depth_camera([each.depth for each in posed if each.depth is not None], size, matrix),
     )
 
@@ -107,8 +107,8 @@ def _depth_choice(depth: Sequence[Path | None], confidence: Sequence[Path | None
     sure = sum(None not in pair for pair in zip(depth, confidence, strict=True))
     if not count:
         return {}
-    said = f"pixels of confidence 0, of 0 to 2, are left out in {sure} of {count} frames" if sure else "all pixels"
-    return {"depth": said}
+    rule = f"pixels of confidence 0, of 0 to 2, are left out in {sure} of {count} frames" if sure else "all pixels"
+    return {"depth": rule}
 
 
 def _odometry(path: Path) -> Table:

@@ -28,9 +28,9 @@ UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _PER_S = {unit: 10**9 // per_ns for unit, per_ns in UNITS_NS.items()}
 _SINCE_1970_S = (5 * 10**8, 5 * 10**9)  # from 1985 to 2128
 _LONGEST_STEP_S = 2  # from a frame to the next
-_LEAST_STEP_OF_WHOLE = 2000  # frames are numbered in smaller steps
+_MIN_INTEGER_STEP = 2000  # frames are numbered in smaller steps
 _LARGEST_NS = 2**62
-_MOST_FRAMES = 10**6  # a larger number is not a frame's
+_MAX_FRAMES = 10**6  # a larger number is not a frame's
 _NUMBER = re.compile(r"\D*?(\d+(?:\.\d+)?)\D*", re.ASCII)
 
 
@@ -57,13 +57,13 @@ class Stamps:
         return f"{self.ns.min() / 1e9:.2f} to {self.ns.max() / 1e9:.2f} s, read as {self.unit}"
 
 
-def stamps_of(words: Sequence[str], like: Stamps | None = None, said: str = "") -> Stamps | None:
+def stamps_of(words: Sequence[str], like: Stamps | None = None, stated_unit: str = "") -> Stamps | None:
     """Times of words, in the unit that fits their size; None where one is not a number.
 
     Args:
         words: as they were written.
         like: other times of the same recording: of units that could be, the one in which both overlap most.
-        said: the unit that a file states; taken where their size allows it.
+        stated_unit: the unit that a file states; taken where their size allows it.
     """
     numbers = [number for word in words if (number := _number(word)) is not None]
     if not numbers or len(numbers) < len(words):
@@ -76,8 +76,8 @@ def stamps_of(words: Sequence[str], like: Stamps | None = None, said: str = "") 
     known = {unit: ns for unit, ns in units.items() if ns is not None}
     if not known:
         return None
-    if said in known:
-        unit = said
+    if stated_unit in known:
+        unit = stated_unit
     else:
         unit = next(iter(known)) if like is None else max(known, key=lambda each: _overlap(known[each], like.ns))
     return Stamps(known[unit], unit)
@@ -137,7 +137,7 @@ def image_stamps(images: Sequence[Path]) -> Stamps | None:
     numbers = sorted(map(Decimal, words))
     steps = sorted(after - before for before, after in pairwise(numbers))
     is_epoch = len(_possible(numbers)) == 1
-    return stamps if is_epoch or (steps and steps[len(steps) // 2] >= _LEAST_STEP_OF_WHOLE) else None
+    return stamps if is_epoch or (steps and steps[len(steps) // 2] >= _MIN_INTEGER_STEP) else None
 
 
 @dataclass(frozen=True)
@@ -224,11 +224,11 @@ def associated(first: NDArray[Any], second: NDArray[Any], farthest: float = FART
     after = np.searchsorted(ordered, first).clip(0, len(order) - 1)
     before = (after - 1).clip(0)
     nearest = np.where(first - ordered[before] <= np.abs(ordered[after] - first), before, after)
-    apart = np.abs(ordered[nearest] - first)
-    closest_first = np.argsort(apart, kind="stable")
+    difference = np.abs(ordered[nearest] - first)
+    closest_first = np.argsort(difference, kind="stable")
     _, kept = np.unique(nearest[closest_first], return_index=True)
     rows = np.sort(closest_first[kept])
-    return [(i, int(order[nearest[i]])) for i in rows[apart[rows] < farthest].tolist()]
+    return [(i, int(order[nearest[i]])) for i in rows[difference[rows] < farthest].tolist()]
 
 
 def _by_name(images: Sequence[Path], words: Sequence[str]) -> tuple[list[tuple[int, int]], str, list[str]] | None:
@@ -254,6 +254,6 @@ def _plain(name: str) -> str:
         return stem
     number = _number(stem)
     is_time = "." in stem.removesuffix(".0")  # 12.000 may be a second, and no frame's number
-    if number is None or (is_time and number < _MOST_FRAMES):
+    if number is None or (is_time and number < _MAX_FRAMES):
         return stem
     return format(number.normalize(), "f")

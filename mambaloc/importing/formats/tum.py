@@ -132,7 +132,7 @@ def _capture(
 ) -> Capture:
     """Images with the row of their pose and their time, as a capture."""
     table, layout = trajectory
-    scalar, said = layout.scalar or "last", "its header says" if layout.scalar else "the format has them"
+    scalar, scalar_source = layout.scalar or "last", "its header says" if layout.scalar else "the format has them"
     quaternion = table.numbers[:, 3:] if scalar == "first" else np.roll(table.numbers[:, 3:], 1, axis=1)
     checked = from_quaternions(table.numbers[:, :3], quaternion, table.where)
     unit: Unit = "metre" if kind == "tum_rgbd" else "unknown"
@@ -140,7 +140,7 @@ def _capture(
     known = "metres, as the benchmark has them" if unit == "metre" else "unknown: a trajectory does not state it"
     choices = {
         "axes": "OpenCV camera axes, as the format has them",
-        "direction": f"camera-to-world, scalar {scalar}, as {said}",
+        "direction": f"camera-to-world, scalar {scalar}, as {scalar_source}",
         "scale": scale_of(length_m, known),
         "origin": "kept",
         "association": how,

@@ -19,37 +19,37 @@ from typing import Any
 
 _FEATURES, _LONGEST_PX = 4096, 1600
 
-Tell = Callable[..., None]
+Report = Callable[..., None]
 
 
 def main(job: Mapping[str, Any]) -> None:
     """Find features, match them, place the images, and write the largest model if there is one."""
-    tell = _speaker()
+    report = _reporter()
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     try:
-        tell(step="Finding features")
+        report(step="Finding features")
         find_features(pycolmap, job)
-        tell(step="Matching frames")
+        report(step="Matching frames")
         match_features(pycolmap, job)
-        tell(step="Placing frames", of=len(job["names"]))
-        tell(placed=_place_images(pycolmap, job, tell))
+        report(step="Placing frames", of=len(job["names"]))
+        report(placed=_place_images(pycolmap, job, report))
     except (RuntimeError, ValueError) as error:  # what pycolmap makes of C++'s
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        tell(error=lines[-1][:200])
+        report(error=lines[-1][:200])
 
 
-def _speaker() -> Tell:
+def _reporter() -> Report:
     """A function that writes a JSON line to stdout, where COLMAP no longer writes."""
     stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
 
-    def tell(**message: object) -> None:
+    def report(**message: object) -> None:
         stdout.write(json.dumps(message) + "\n")
         stdout.flush()
 
-    return tell
+    return report
 
 
 def find_features(pycolmap: Any, job: Mapping[str, Any]) -> None:
@@ -76,14 +76,14 @@ def match_features(pycolmap: Any, job: Mapping[str, Any]) -> None:
         pycolmap.match_sequential(job["database"], matching, pairing, verification)
 
 
-def _place_images(pycolmap: Any, job: Mapping[str, Any], tell: Tell) -> int:
+def _place_images(pycolmap: Any, job: Mapping[str, Any], report: Report) -> int:
     """How many images the largest model places, which is written."""
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=job["seed"], extract_colors=False)
     work = Path(job["database"]).with_suffix(".models")  # COLMAP writes every model there
     work.mkdir()
 
     def advance() -> None:
-        tell(advance=1)
+        report(advance=1)
 
     models = pycolmap.incremental_mapping(
         job["database"], job["images"], work, options, initial_image_pair_callback=advance, next_image_callback=advance

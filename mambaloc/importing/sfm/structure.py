@@ -27,15 +27,15 @@ from mambaloc.importing.sfm.process import Job, reconstruct
 from mambaloc.importing.sfm.unread import pose_like, warning_of
 from mambaloc.importing.undistort.decoding import choices_of, counts_of
 from mambaloc.importing.video import VIDEO_SUFFIXES, Counted, digest_of, write_frames
-from mambaloc.runtime.sources import PICTURES_HZ, SourceFrame, frames_of
-from mambaloc.user_cache import made_once
+from mambaloc.runtime.sources import IMAGES_HZ, SourceFrame, frames_of
+from mambaloc.user_cache import cached_folder
 
 _NEIGHBOURS = 10  # before and after a video's frame that it is matched with, beside those 2, 4, 8, ... apart
 _VERSION = 1  # of what is kept: another one is made again
-_MOST_PHOTOGRAPHS = 60  # every pair of so many is matched; a folder of more is taken for a video's frames
-_MOST_FRAMES = 400  # of a video: placing a hundred takes minutes
+_MAX_IMAGES = 60  # every pair of so many is matched; a folder of more is taken for a video's frames
+_MAX_FRAMES = 400  # of a video: placing a hundred takes minutes
 _FEWEST_FRAMES = 5
-_LEAST_PLACED = 0.5
+_MIN_PLACED = 0.5
 _ADVICE = (
     "film slowly and sideways rather than turning on the spot, with texture, light and little motion in view, and "
     "return to where you began"
@@ -67,7 +67,7 @@ def read_structure(source: Path, threads: int = -1, seed: int = 0) -> Capture:
         console.print(f"{source}: {warning_of(unread)}", markup=False, soft_wrap=True)
     source = source if source.is_file() else first_with_images([source, source / "images"])
     digest = digest_of([source] if source.is_file() else list_images(source), _VERSION, seed)
-    folder = made_once(f"structure/{digest}", lambda partial: _make(source, partial, threads, seed))
+    folder = cached_folder(f"structure/{digest}", lambda partial: _make(source, partial, threads, seed))
     note = json.loads((folder / "note.json").read_text(encoding="utf-8"))
     capture = read_colmap(folder)
     placed = set(capture.images)
@@ -92,23 +92,23 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         counts = None if source.is_file() else counts_of(list_images(source))
         frames, total = frames_of(source) if source.is_file() else _of_images(source, counts)
-        is_film = source.is_file() or (total or 0) > _MOST_PHOTOGRAPHS
+        is_video = source.is_file() or (total or 0) > _MAX_IMAGES
         seen = Counted(progress.track(frames, total=total, description="Choosing frames"))
-        time_s, sizes = write_frames(choose_frames(seen) if is_film else seen, images)
+        time_s, sizes = write_frames(choose_frames(seen) if is_video else seen, images)
         names = _thinned(images, sorted(time_s))
         if len(names) < _FEWEST_FRAMES:
             few = f"{len(names)} frames that differ, of {_FEWEST_FRAMES} at least"
             raise InputError(f"{source}: shows {few}; {_ADVICE}")
-        neighbours = _NEIGHBOURS if is_film else None
+        neighbours = _NEIGHBOURS if is_video else None
         job = Job(images, names, folder / "sparse/0", len(sizes) == 1, neighbours, threads, seed)
         placed = reconstruct(job, source, _ADVICE, progress)
     share = f"{placed} of {len(names)} frames"
-    if placed < max(_FEWEST_FRAMES, _LEAST_PLACED * len(names)):
-        raise InputError(f"{source}: only {share} could be placed, less than {_LEAST_PLACED:.0%}; {_ADVICE}")
+    if placed < max(_FEWEST_FRAMES, _MIN_PLACED * len(names)):
+        raise InputError(f"{source}: only {share} could be placed, less than {_MIN_PLACED:.0%}; {_ADVICE}")
     chosen = f"{len(names)} of {seen.count}, by sharpness and movement"
     choices = {
-        "frames": chosen if is_film else f"all {len(names)} photos",
-        "matching": f"{_NEIGHBOURS} neighbours of each, and farther ones" if is_film else "every pair",
+        "frames": chosen if is_video else f"all {len(names)} photos",
+        "matching": f"{_NEIGHBOURS} neighbours of each, and farther ones" if is_video else "every pair",
         "registered": f"{share} ({placed / len(names):.0%})",
         **choices_of(counts),
     }
@@ -119,14 +119,12 @@ def _make(source: Path, folder: Path, threads: int, seed: int) -> None:
 def _of_images(folder: Path, counts: Counts | None) -> tuple[Iterator[SourceFrame], int]:
     """A folder's images in natural order, as frames."""
     paths = list_images(folder)
-    return (SourceFrame(str(at), at / PICTURES_HZ, read_image(path, counts)) for at, path in enumerate(paths)), len(
-        paths
-    )
+    return (SourceFrame(str(at), at / IMAGES_HZ, read_image(path, counts)) for at, path in enumerate(paths)), len(paths)
 
 
 def _thinned(folder: Path, names: list[str]) -> list[str]:
     """Keep at most so many frames, evenly."""
-    rows = np.unique(np.linspace(0, len(names) - 1, min(_MOST_FRAMES, len(names))).round().astype(int))
+    rows = np.unique(np.linspace(0, len(names) - 1, min(_MAX_FRAMES, len(names))).round().astype(int))
     kept = [names[row] for row in rows.tolist()]
     for name in set(names) - set(kept):
         (folder / name).unlink()

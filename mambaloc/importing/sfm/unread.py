@@ -11,7 +11,7 @@ _SUFFIXES = {
     *(".bin", ".db", ".npy", ".npz", ".mat", ".pkl", ".pickle", ".g2o", ".bag", ".pose", ".trj"),
 }
 _NO_POSES = re.compile(r"readme|licen[cs]e|notice|copying|requirements", re.IGNORECASE)
-_MOST_FILES = 100_000
+_MAX_FILES = 100_000
 _NAMED = 3
 
 
@@ -23,7 +23,7 @@ def pose_like(source: Path) -> list[str]:
     if source.is_file():
         return sorted(path.name for path in source.parent.glob("*") if path.stem == source.stem and _is_like(path))
     files = (path for pattern in ("*", "*/*") for path in source.glob(pattern))
-    found = [path.relative_to(source) for path in islice(files, _MOST_FILES) if _is_like(path)]
+    found = [path.relative_to(source) for path in islice(files, _MAX_FILES) if _is_like(path)]
     return [path.as_posix() for path in sorted(found, key=lambda path: (len(path.parts), path))]
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.motion import Motion, apart, quaternions
+from mambaloc.importing.motion import Motion, pairwise_distances, quaternions
 from mambaloc.importing.splits.selection import (
     COVERAGE_DEG,
-    MOST_NEAR,
+    MAX_NEAR,
     NEAR_STEPS,
     Kind,
     SplitCandidate,
@@ -22,9 +22,9 @@ from mambaloc.importing.splits.selection import (
 
 TEST_SHARE, VAL_SHARE = 0.2, 0.1
 
-_LEAST_BLOCK = 3
-_MOST_BLOCKS = 5
-_GAP_SHARE, _LEAST_GAP = 0.02, 1
+_MIN_BLOCK = 3
+_MAX_BLOCKS = 5
+_GAP_SHARE, _MIN_GAP = 0.02, 1
 _AT_ONCE = 500  # frames whose distances to all others are held
 _MANY_SEQUENCES = 5  # of which every fifth makes a test split, too
 _PASS_SHARE = 0.1  # of a sequence: frames nearer in time are of the same pass
@@ -33,7 +33,7 @@ _COVERED = 0.9
 _LOOP_SHARES = (TEST_SHARE, 0.15, 0.1)
 _LOOP_FRAMES = 1500  # of a sequence that are looked at, evenly spread
 _VAL_PLACES = 12
-_LEAST_STEPS = 1e-3  # where frames coincide
+_MIN_STEPS = 1e-3  # where frames coincide
 
 Rows = NDArray[np.int64]
 
@@ -59,11 +59,11 @@ class _Advisor:
         # Frames in no order of time are laid along the scene's longest axis, as if they were one recording.
         names = np.array(capture.sequences) if motion.in_order else np.full(len(capture.images), "all")
         self.sequences = [self._laid_out(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
-        self.gap = max(_LEAST_GAP, round(_GAP_SHARE * max(map(len, self.sequences))))
+        self.gap = max(_MIN_GAP, round(_GAP_SHARE * max(map(len, self.sequences))))
 
     def given(self) -> SplitCandidate | None:
         split = np.array(self.capture.split if self.capture.split is not None else (), dtype="<U6")
-        if not _is_whole(split):
+        if not _is_complete(split):
             return None
         return self.with_validation(self._measured("given", "as the capture's own files have it", split))
 
@@ -76,7 +76,7 @@ class _Advisor:
         found: list[SplitCandidate] = []
         for group in groups if len(self.sequences) > 1 else []:
             rows = np.concatenate(group)
-            if _LEAST_BLOCK <= len(rows) <= total / 2:
+            if _MIN_BLOCK <= len(rows) <= total / 2:
                 named = ", ".join(self.capture.sequences[rows[0]] for rows in group)
                 how = f"{named if len(named) < 60 else f'every {_MANY_SEQUENCES}th'} of {len(self.sequences)} sequences"
                 found.append(self._measured("sequence", how, self._split(test=rows)))
@@ -99,19 +99,19 @@ class _Advisor:
         """The block of a sequence that is best seen from another pass, a fifth of it or less; None where none is."""
         every = -(-len(rows) // _LOOP_FRAMES)
         thin = rows[::every]
-        length, turn_deg = apart(self.position, self.quaternion, thin, thin)
+        length, turn_deg = pairwise_distances(self.position, self.quaternion, thin, thin)
         is_seen = (length <= _LOOP_REACH * self.motion.extent) & (turn_deg <= COVERAGE_DEG)
         steps = self.motion.steps(length, turn_deg)
         time = np.arange(len(thin))
         window = max(self.gap, round(_PASS_SHARE * len(thin)))
         for share in _LOOP_SHARES:
-            size = max(_LEAST_BLOCK, round(share * len(thin)))
+            size = max(_MIN_BLOCK, round(share * len(thin)))
             found = []
             for start in range(0, len(thin) - size + 1, max(1, size // 8)):
                 block, others = slice(start, start + size), (time < start - window) | (time >= start + size + window)
                 if others.any() and is_seen[block][:, others].any(axis=1).mean() >= _COVERED:
                     nearest = steps[block][:, others].min(axis=1)
-                    leaks = bool((nearest <= NEAR_STEPS).mean() > MOST_NEAR)
+                    leaks = bool((nearest <= NEAR_STEPS).mean() > MAX_NEAR)
                     found.append((leaks, float(np.quantile(nearest, 0.9)), start))
             if found:
                 start = min(found)[2]
@@ -122,9 +122,9 @@ class _Advisor:
         """Evenly spread blocks of a fifth of all frames, as few as make a good split; what is near them is left out."""
         total = len(self.capture.images)
         found: list[SplitCandidate] = []
-        for count in range(1, _MOST_BLOCKS + 1):
+        for count in range(1, _MAX_BLOCKS + 1):
             size = max(1, round(TEST_SHARE * total / count))
-            if found and size < _LEAST_BLOCK:
+            if found and size < _MIN_BLOCK:
                 break
             split = self._without_near(self._in_blocks(self._spread(count, size), self.gap))
             blocks = f"{count} block{'s' if count > 1 else ''} of {size} frames"
@@ -140,11 +140,13 @@ class _Advisor:
         for rows in self.sequences:
             test, near = rows[split[rows] == "test"], np.zeros(len(rows), dtype=bool)
             for start in range(0, len(test), _AT_ONCE):
-                length, turn_deg = apart(self.position, self.quaternion, test[start : start + _AT_ONCE], rows)
+                length, turn_deg = pairwise_distances(
+                    self.position, self.quaternion, test[start : start + _AT_ONCE], rows
+                )
                 steps = self.motion.steps(length, turn_deg)
                 near |= (steps <= NEAR_STEPS).any(axis=0)
             sparse[rows[near & (split[rows] == "train")]] = "unused"
-        return sparse if _is_whole(sparse) else split
+        return sparse if _is_complete(sparse) else split
 
     def with_validation(self, proposal: SplitCandidate) -> SplitCandidate:
         """Mark training frames for validation: a block, after a gap, or a recording.
@@ -155,8 +157,8 @@ class _Advisor:
         if (proposal.split == "val").any():
             return proposal
         train = proposal.split == "train"
-        size = max(_LEAST_BLOCK, round(VAL_SHARE * len(self.capture.images)))
-        best, least = proposal, np.inf
+        size = max(_MIN_BLOCK, round(VAL_SHARE * len(self.capture.images)))
+        best, lowest_cost = proposal, np.inf
         for rows in self._places(train, size):
             split = proposal.split.copy()
             split[self._around(rows, self.gap) & train] = "unused"
@@ -166,8 +168,8 @@ class _Advisor:
             found = self._measured(proposal.kind, proposal.how, split)
             of_val = distances(self.capture, self.motion, rows, np.flatnonzero(split == "train"))[2]
             cost = abs(_log_ratio(np.median(of_val), found.steps[1])) + _log_ratio(found.steps[1], proposal.steps[1])
-            if cost < least:
-                best, least = found, cost
+            if cost < lowest_cost:
+                best, lowest_cost = found, cost
         return best
 
     def _places(self, train: NDArray[np.bool_], size: int) -> list[Rows]:
@@ -228,9 +230,9 @@ class _Advisor:
         return measured(kind, how, split, self.capture, self.motion)
 
 
-def _is_whole(split: NDArray[np.str_]) -> bool:
+def _is_complete(split: NDArray[np.str_]) -> bool:
     return {"train", "test"} <= set(split.tolist())
 
 
 def _log_ratio(a: float | np.floating, b: float) -> float:
-    return float(np.log(max(a, _LEAST_STEPS) / max(b, _LEAST_STEPS)))
+    return float(np.log(max(a, _MIN_STEPS) / max(b, _MIN_STEPS)))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mambaloc.errors import InputError
 from mambaloc.importing.capture import Capture
-from mambaloc.importing.motion import Motion, apart, quaternions
+from mambaloc.importing.motion import Motion, pairwise_distances, quaternions
 
 Kind = Literal["given", "sequence", "loop", "block"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -24,11 +24,11 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 ASKED = ("auto", *KINDS)
 
 NEAR_STEPS = 2.0
-MOST_NEAR = 0.1
+MAX_NEAR = 0.1
 COVERAGE_RADIUS = 0.25
 COVERAGE_DEG = 30.0
 RULE = (
-    f"A split is honest where at most {MOST_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
+    f"A split is honest where at most {MAX_NEAR:.0%} of its test frames are near, within {NEAR_STEPS:g} steps of a "
     f"training frame, and learnable where the median test frame's nearest one is within {COVERAGE_RADIUS:.0%} of the "
     f"scene's extent and {COVERAGE_DEG:g}°. A given split is taken, whatever it measures. Of the others, the first "
     f"that is both is taken, in the order {', '.join(KINDS[1:])}; failing that, the one with the fewest near frames of "
@@ -67,7 +67,7 @@ class SplitCandidate:
     @property
     def is_leak_free(self) -> bool:
         """Whether hardly any test frame is a training frame's neighbour."""
-        return self.near <= MOST_NEAR
+        return self.near <= MAX_NEAR
 
     @property
     def is_good(self) -> bool:
@@ -87,8 +87,8 @@ class SplitCandidate:
             "how": self.how,
             "frames": self.counts,
             "test_to_nearest_train": {
-                name: dict(zip(("10%", "median", "90%"), (round(each, 5) for each in told), strict=True))
-                for name, told in quantiles.items()
+                name: dict(zip(("10%", "median", "90%"), (round(each, 5) for each in values), strict=True))
+                for name, values in quantiles.items()
             },
             f"within_{NEAR_STEPS:g}_steps": round(self.near, 4),
             "honest": self.is_leak_free,
@@ -151,7 +151,7 @@ def _lacks_given(capture: Capture) -> str:
 
 def best_of(proposals: Sequence[SplitCandidate]) -> SplitCandidate:
     """The one with the fewest near frames of those that are learnable, or of all; among honest ones, the nearest."""
-    return min(proposals, key=lambda each: (not each.is_covered, max(each.near, MOST_NEAR), each.steps[1]))
+    return min(proposals, key=lambda each: (not each.is_covered, max(each.near, MAX_NEAR), each.steps[1]))
 
 
 def measured(kind: Kind, how: str, split: NDArray[np.str_], capture: Capture, motion: Motion) -> SplitCandidate:
@@ -173,7 +173,7 @@ def distances(
     Of more than a few hundred, evenly spread ones are measured.
     """
     rows = rows[np.linspace(0, len(rows) - 1, min(_MEASURED, len(rows))).round().astype(int)]
-    length, turn_deg = apart(capture.world_from_cam[:, :3, 3], quaternions(capture), rows, others)
+    length, turn_deg = pairwise_distances(capture.world_from_cam[:, :3, 3], quaternions(capture), rows, others)
     steps = motion.steps(length, turn_deg)
     nearest = steps.argmin(axis=1)
     every = np.arange(len(rows))

@@ -70,13 +70,13 @@ class Decoding:
 
     def choices(self) -> dict[str, str]:
         """What was decided, by name."""
-        said = []
+        notes = []
         if self.turned:
-            said.append(f"upright, as the cameras' sizes say: {self._some(self.turned)} were turned")
+            notes.append(f"upright, as the cameras' sizes say: {self._some(self.turned)} were turned")
         if self.stored:
             why = f"as {self.known} reads them" if self.known else "taken so: the format does not say"
-            said.append(f"as stored, {why}; {self._some(self.stored)} have an EXIF orientation, dropped")
-        return {"pixels": "; ".join(said) or "as stored; no image has an EXIF orientation", **choices_of(self.counts)}
+            notes.append(f"as stored, {why}; {self._some(self.stored)} have an EXIF orientation, dropped")
+        return {"pixels": "; ".join(notes) or "as stored; no image has an EXIF orientation", **choices_of(self.counts)}
 
     def _some(self, paths: Sequence[Path]) -> str:
         return f"{len(paths)} of {self.count} images (such as {paths[0].name})"
@@ -92,11 +92,11 @@ def choices_of(counts: Counts | None) -> dict[str, str]:
     if counts is None:
         return {}
     black, white = counts
-    said = (
+    rule = (
         f"counts {black} to {white} are black to white in all images, which hold 8 bits now; images to localize "
         f"need the same: localize.py --counts {black},{white}"
     )
-    return {"16 bits": said}
+    return {"16 bits": rule}
 
 
 def decoding_of(capture: Capture) -> Decoding:

@@ -29,21 +29,21 @@ _MAPS_KEPT = 4  # of cameras, at a time: each is as large as a few images
 class FittedCameras:
     """A capture's cameras, each fitted to the sizes of its own images."""
 
-    def __init__(self, told: Mapping[str, Camera]) -> None:
-        self.told = told
+    def __init__(self, cameras: Mapping[str, Camera]) -> None:
+        self.cameras = cameras
         self.found: dict[tuple[str, Size], tuple[Camera, Camera] | None] = {}
         self.maps = lru_cache(_MAPS_KEPT)(self._maps)
         self.lock = Lock()  # the first images of a camera all ask for its maps
 
     def size(self, name: str) -> Size:
         """Size of the images that a camera is given for."""
-        return self.told[name].size
+        return self.cameras[name].size
 
     def fitted(self, name: str, size: Size) -> tuple[Camera, Maps | None] | None:
         """The lens in pixels of an image of that size, and maps that undistort it; None where the shapes differ."""
         with self.lock:
             if (name, size) not in self.found:
-                lens = fitted(self.told[name], size)
+                lens = fitted(self.cameras[name], size)
                 self.found[name, size] = None if lens is None else (lens, pinhole_of(name, lens))
             found = self.found[name, size]
             return found and (found[0], self.maps(name, size))
@@ -115,8 +115,8 @@ def common_sizes(sizes: Iterable[Size]) -> dict[Size, Size]:
     counts = Counter(sizes)
     groups: dict[Size, list[Size]] = {}
     for size in sorted(counts, key=lambda size: (-counts[size], size)):
-        most = next((other for other in groups if _is_near(size, other)), size)
-        groups.setdefault(most, []).append(size)
+        common = next((other for other in groups if _is_near(size, other)), size)
+        groups.setdefault(common, []).append(size)
     found = {}
     for group in groups.values():
         width, height = min(width for width, _ in group), min(height for _, height in group)

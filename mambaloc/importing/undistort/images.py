@@ -77,22 +77,22 @@ def write_images(capture: Capture, folder: Path) -> Written:
     kept = selected(capture, list(taken))
     decoding = decoding.decided({capture.images[row]: is_upright for row, (_, is_upright) in done.items()})
     names, pinholes, lenses = cameras.as_used(kept.camera_of, list(taken.values()), common)
-    said = _said(capture.cameras, lenses, len(odd), len(taken))
-    images, choices = tuple(targets[row] for row in taken), {**capture.choices, **decoding.choices(), **said}
+    size_choices = _size_choices(capture.cameras, lenses, len(odd), len(taken))
+    images, choices = tuple(targets[row] for row in taken), {**capture.choices, **decoding.choices(), **size_choices}
     kept = replace(kept, images=images, cameras=pinholes, camera_of=names, choices=choices)
     return Written(kept, [common[size] for size in taken.values()], rules, lenses, decoding)
 
 
-def _said(told: Mapping[str, Camera], lenses: Mapping[str, Camera], odd: int, count: int) -> dict[str, str]:
+def _size_choices(given: Mapping[str, Camera], lenses: Mapping[str, Camera], odd: int, count: int) -> dict[str, str]:
     """What was decided of images whose size is not their camera's, or not the others'."""
-    found, known = ({(each.width, each.height) for each in cameras.values()} for cameras in (lenses, told))
-    said = {}
+    found, known = ({(each.width, each.height) for each in cameras.values()} for cameras in (lenses, given))
+    choices = {}
     if sizes := sorted(found - known):
         named = ", ".join(map(_times, sizes[:3]))
-        said["scaled cameras"] = f"to images of the same shape and another size than the capture says ({named})"
+        choices["scaled cameras"] = f"to images of the same shape and another size than the capture says ({named})"
     if odd:
-        said["cropped"] = f"{odd} of {count} images to the middle, so that sizes near each other are one"
-    return said
+        choices["cropped"] = f"{odd} of {count} images to the middle, so that sizes near each other are one"
+    return choices
 
 
 def selected(capture: Capture, rows: Sequence[int]) -> Capture:

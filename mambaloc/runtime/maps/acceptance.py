@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 RULE = 3
 """Version of what follows."""
-LEAST_PROBABILITY = 0.95
+MIN_PROBABILITY = 0.95
 """The least probability of an accepted pose: of such poses of held-out training frames at most 0.5 % were wrong."""
-MOST_DEVIATION = 0.12
+MAX_DEVIATION = 0.12
 """The largest :attr:`Evidence.deviation` of an accepted pose: 8 cm in a room where key frames spread over 0.66 m."""
 CALIBRATION = {"frames": 224, "pictures": 3222, "accepted": 0.677, "accepted_and_wrong": 0.0009}
 """How that was measured: frames held out of training, of a real room and a rendered one, each in two maps; disturbed
@@ -26,7 +26,7 @@ other sequences; and of these the wrong ones' (95 %: 0.03 to 0.33 %)."""
 
 _CELLS = 4  # a side of the grid
 _CONSTANT, _PER_CELLS, _PER_DEVIATION, _PER_TURN = -4.9, 3.48, -0.34, -1.01
-_LEAST_DEVIATION, _LEAST_TURN_DEG = 1e-3, 0.1
+_MIN_DEVIATION, _MIN_TURN_DEG = 1e-3, 0.1
 _FOCAL_OFF, _FOCAL_DEVIATIONS = 0.03, 3.0
 
 
@@ -56,14 +56,14 @@ class Evidence:
     @property
     def is_enough(self) -> bool:
         """Whether the pose is accepted, if it has enough inliers and the focal length fits."""
-        return self.probability >= LEAST_PROBABILITY and self.deviation <= MOST_DEVIATION
+        return self.probability >= MIN_PROBABILITY and self.deviation <= MAX_DEVIATION
 
     def logarithms(self) -> tuple[float, float, float]:
         """What the regression is linear in."""
         return (
             math.log(self.cells + 0.5),
-            math.log(max(self.deviation, _LEAST_DEVIATION)),
-            math.log(self.turn_deg + _LEAST_TURN_DEG),
+            math.log(max(self.deviation, _MIN_DEVIATION)),
+            math.log(self.turn_deg + _MIN_TURN_DEG),
         )
 
 

@@ -120,5 +120,5 @@ def _covariance(key_poses: Floats, nugget: float) -> Floats:
 
 def _kernel(places: Floats, others: Floats) -> Floats:
     """Matérn's covariance of smoothness 3/2, (M, 6) and (N, 6) to (M, N)."""
-    apart = np.sqrt(3 * ((places[:, None] - others) ** 2).sum(axis=-1)) / _LENGTH
-    return np.asarray((1 + apart) * np.exp(-apart))
+    distance = np.sqrt(3 * ((places[:, None] - others) ** 2).sum(axis=-1)) / _LENGTH
+    return np.asarray((1 + distance) * np.exp(-distance))

@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 DESCRIPTOR_SCALE = 512.0
 """A stored descriptor is the unit vector times this, rounded and cut to 0..255, as COLMAP has it."""
 
-_MOST_KEYPOINTS = 1000
+_MAX_KEYPOINTS = 1000
 _CONTRAST = 0.02  # half of OpenCV's default: small images have few keypoints
 
 
@@ -99,7 +99,7 @@ def find_keypoints(image: Image, scale: float) -> Keypoints:
     if size != (width, height):
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     # The precise upscale puts keypoints where they are; otherwise each is 0.25 px to the lower right.
-    sift = cv2.SIFT.create(_MOST_KEYPOINTS, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(_MAX_KEYPOINTS, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     keypoints, histograms = sift.detectAndCompute(grey, None)
     pixels = np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2)
     whole = np.zeros((0, 128), np.uint8) if histograms is None else histograms.astype(np.uint8)  # they are whole
@@ -189,5 +189,5 @@ def mutual(similarity_NM: NDArray[np.float32], best_N: NDArray[np.int64]) -> NDA
     """Whether each row is also the best of its best column, (N,)."""
     if not similarity_NM.size:
         return np.zeros(len(best_N), bool)
-    most = similarity_NM.max(axis=0)  # argmax along columns takes six times as long
-    return np.asarray(similarity_NM[np.arange(len(best_N)), best_N] >= most[best_N])
+    column_max_M = similarity_NM.max(axis=0)  # argmax along columns takes six times as long
+    return np.asarray(similarity_NM[np.arange(len(best_N)), best_N] >= column_max_M[best_N])

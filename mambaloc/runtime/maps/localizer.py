@@ -38,7 +38,7 @@ _GUIDED_FARTHEST = 0.9  # of unit descriptors
 _NEAREST = 8  # key frames whose points are searched again
 _WINDOWS = (6.0, 2.0)  # radii of the guided rounds, in times of what is near
 _PRIOR_WINDOW = 12.0  # radius around a prior: 54 px at a width of 160
-_LEAST_SHARE = 0.1
+_MIN_SHARE = 0.1
 _SHARED = 1.25  # of variances: neighbouring matches share errors; chosen on frames held out of rendered rooms
 
 
@@ -167,7 +167,7 @@ class MapLocalizer:
             seen_m, rays = self._points_m[matches.points], features.rays[matches.keypoints]
             pose = refine_pose(pose, seen_m, rays, finest)
             off = np.linalg.norm(pose.project(seen_m)[0] - rays, axis=1)
-            scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _LEAST_SHARE * near))
+            scale = min(near / 2, max(2.5 * float(np.nanmedian(off)), _MIN_SHARE * near))
         is_inlier = off <= near
         covariance = pose_covariance(pose, seen_m, rays, finest)
         evidence = self._evidence(features, matches, is_inlier, start, pose, finest, _deviation_m(covariance))
@@ -220,28 +220,28 @@ class MapLocalizer:
             inside = ((projected >= corners[0]) & (projected <= corners[1])).all(axis=1)
         visible = np.flatnonzero(inside & self._seen_around(pose))
         similarity = features.descriptors @ self._descriptors[visible].T
-        most = similarity.max(axis=1, initial=-1)
+        row_max = similarity.max(axis=1, initial=-1)
         np.copyto(similarity, -1, where=_square_distances(features.rays, projected[visible]) > radius**2)
         best, is_clear = unambiguous(similarity, _GUIDED_RATIO)
         rows = np.flatnonzero(is_clear & mutual(similarity, best))
         rows = rows[distance(similarity[rows, best[rows]]) < _GUIDED_FARTHEST]
-        return _Matches(rows, visible[best[rows]], similarity[rows, best[rows]] >= most[rows])
+        return _Matches(rows, visible[best[rows]], similarity[rows, best[rows]] >= row_max[rows])
 
     def _seen_around(self, pose: CameraPose) -> NDArray[np.bool_]:
         """Which points one of the nearest key frames sees, (P,): what is hidden from there is not searched.
 
         Where the poses of a capture drift, these also agree best with each other.
         """
-        apart = ((self._viewpoints - viewpoints(pose.matrix[None], self._unit_m)) ** 2).sum(axis=1)
-        nearest = np.argsort(apart, kind="stable")[:_NEAREST]
+        squared = ((self._viewpoints - viewpoints(pose.matrix[None], self._unit_m)) ** 2).sum(axis=1)
+        nearest = np.argsort(squared, kind="stable")[:_NEAREST]
         return np.asarray(self._views[nearest].any(axis=0))
 
     def _is_own_camera(self, features: Features) -> bool:
         """Whether an image, of any resolution, claims to be of the map's camera, whose lens is known."""
-        (width, height), most = self.map.size, 0.01 * self.map.size[0]
+        (width, height), tolerance_px = self.map.size, 0.01 * self.map.size[0]
         as_large = rescaled_intrinsics(features.intrinsics, features.size, self.map.size)
-        has_shape = abs(features.size[1] * width / features.size[0] - height) <= most
-        return has_shape and bool(np.abs(as_large - self.map.intrinsics).max() <= most)
+        has_shape = abs(features.size[1] * width / features.size[0] - height) <= tolerance_px
+        return has_shape and bool(np.abs(as_large - self.map.intrinsics).max() <= tolerance_px)
 
     def _intrinsics(self, image: Image) -> Floats:
         height, width = image.shape[:2]

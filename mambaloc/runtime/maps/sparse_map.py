@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from mambaloc.errors import InputError
-from mambaloc.files import whole_file, writing
+from mambaloc.files import atomic_file, writing
 from mambaloc.images import LARGEST_SIDE_PX
 from mambaloc.runtime.maps.acceptance import RULE
 from mambaloc.runtime.maps.drift import NUGGET
@@ -28,8 +28,8 @@ VERSION = 2
 """Of files whose drift has changed since the map was built; others are of version 1."""
 MAP_FILE = "map.safetensors"
 """What a map is called in the folders that tools write."""
-_MOST_POINTS = 10**7
-_MOST_BYTES = 2**31
+_MAX_POINTS = 10**7
+_MAX_BYTES = 2**31
 _DAMAGE = (ValueError, KeyError, TypeError, RecursionError, MemoryError, SafetensorError)
 
 
@@ -131,7 +131,7 @@ class SparseMap:
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         with writing(path, "free some space, or choose another folder"):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(path) as partial:
+            with atomic_file(path) as partial:
                 partial.write_bytes(save(whole, {"about": json.dumps(about)}))
 
     @classmethod
@@ -142,8 +142,8 @@ class SparseMap:
             InputError: where it is missing, damaged, not a map, or of a newer version.
         """
         try:
-            if path.stat().st_size > _MOST_BYTES:
-                raise ValueError(f"it is larger than {_MOST_BYTES} bytes")
+            if path.stat().st_size > _MAX_BYTES:
+                raise ValueError(f"it is larger than {_MAX_BYTES} bytes")
             data = path.read_bytes()
             arrays = load(data)  # checks the header's length and offsets, so that the header can be read
             about = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["about"])
@@ -169,7 +169,7 @@ class SparseMap:
             raise ValueError("its checksum differs")
         points, key_poses, (width, height) = arrays["points_m"], arrays["key_poses"], map(int, arrays["size"])
         counts = {len(points), len(arrays["descriptors"]), len(arrays["views"])}
-        if len(counts) != 1 or not 0 < len(points) <= _MOST_POINTS:
+        if len(counts) != 1 or not 0 < len(points) <= _MAX_POINTS:
             raise ValueError(f"{counts} points, descriptors and views")
         if not len(key_poses) or arrays["views"].shape[1] != -(-len(key_poses) // 8):
             raise ValueError(f"{len(key_poses)} key frames in views of {arrays['views'].shape[1]} bytes")

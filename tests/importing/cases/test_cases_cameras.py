@@ -181,7 +181,9 @@ def test_a_line_that_is_no_picture_is_named_with_the_rule(tmp_path, kind):
 
 def test_files_beside_pictures_are_named_before_structure_from_motion(tmp_path, capsys, monkeypatch):
     """``paths-elsewhere/up`` has images, and the poses in a folder beside."""
-    monkeypatch.setattr("mambaloc.importing.sfm.structure.made_once", lambda *_: pytest.fail(capsys.readouterr().err))
+    monkeypatch.setattr(
+        "mambaloc.importing.sfm.structure.cached_folder", lambda *_: pytest.fail(capsys.readouterr().err)
+    )
     with pytest.raises(
         pytest.fail.Exception, match=r"not read: nerf/transforms\.json\. If the poses are there, give that"
     ):

@@ -168,7 +168,7 @@ def test_the_right_order_stays(written, matches):
 
 def test_pictures_without_camera_are_compared_with_a_guess(written):
     findings = checked(replace(written, cameras={}, camera_of=None))
-    assert "focal length guessed" in findings[0].said
+    assert "focal length guessed" in findings[0].message
     assert not any(finding.concern for finding in findings)
 
 
@@ -180,7 +180,7 @@ def test_poses_of_no_camera_are_a_concern_without_one(written):
 def test_too_few_matches_are_no_evidence():
     few = Agreement(dict.fromkeys(CONVENTIONS, 0.0), 12, 3, [], np.zeros(len(FOCALS)), 100.0, False)
     (finding,) = check_agreement(few)
-    assert finding.said == "not compared: 12 matches on 3 pairs of images"
+    assert finding.message == "not compared: 12 matches on 3 pairs of images"
     assert finding.concern.startswith("nothing could be compared: 12 matches")
 
 
@@ -308,7 +308,7 @@ def test_each_camera_has_a_focal_length_of_its_own(filmed, with_depth):
 
 def test_frames_between_move_with_their_neighbours(filmed, monkeypatch):
     """Every second frame is adjusted; the whole path was turned aside by a drift, which is taken back from all."""
-    monkeypatch.setattr("mambaloc.importing.checks.adjusting._MOST_FRAMES", 20)
+    monkeypatch.setattr("mambaloc.importing.checks.adjusting._MAX_FRAMES", 20)
     rng, poses = np.random.default_rng(3), filmed.world_from_cam.copy()
     wave = np.sin(np.arange(40)[:, None] / 5 + rng.uniform(0, 6, 3))
     poses[:, :3, :3] = Rotation.from_rotvec(np.radians(0.6) * wave).as_matrix() @ poses[:, :3, :3]

@@ -62,14 +62,14 @@ def test_a_tilted_world_has_no_axis_that_is_up():
     assert up.is_known
     assert up.world_axis is None
     assert up.off_deg == pytest.approx(35)
-    assert "35° from +z" in check_up(capture_of(poses), up).said
+    assert "35° from +z" in check_up(capture_of(poses), up).message
 
 
 def test_cameras_that_point_all_ways_know_no_up():
     poses = circle(200)
     poses[:, :3, :3] = Rotation.random(200, rng=np.random.default_rng(0)).as_matrix()
     finding = check_up(capture_of(poses), up_of(capture_of(poses)))
-    assert finding.said.startswith("unknown")
+    assert finding.message.startswith("unknown")
     assert not finding.concern
 
 
@@ -85,12 +85,12 @@ def test_pictures_on_their_side():
 @pytest.mark.parametrize(("inwards", "said"), [(True, "meet in front of"), (False, "meet behind")])
 def test_where_optical_axes_meet(inwards, said):
     finding = check_axes(capture_of(circle(inwards=inwards)))
-    assert finding.said.startswith(said)
+    assert finding.message.startswith(said)
     np.testing.assert_allclose(finding.figures["point"], 0, atol=1e-6)
 
 
 def test_parallel_axes_meet_nowhere():
-    assert check_axes(capture_of(poses_at(line(30)))).said == "parallel"
+    assert check_axes(capture_of(poses_at(line(30)))).message == "parallel"
 
 
 # --- steps, duplicates, times ----------------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def test_duplicates_are_counted():
     poses = poses_at(line(40))
     poses[10:16] = poses[9]
     finding = sanity.check_duplicates(capture_of(poses), motion_of(capture_of(poses)))
-    assert finding.said == "6"
+    assert finding.message == "6"
     assert "exactly the pose of another" in finding.concern
     poses[:] = poses[0]
     assert sanity.check_duplicates(capture_of(poses), motion_of(capture_of(poses))).is_fatal
@@ -174,7 +174,7 @@ def test_too_few_frames_are_fatal():
     capture = capture_of(poses_at(line(12)), poses_without_image=("b",), images_without_pose=unposed)
     finding = sanity.check_frames(capture, {"a.png": "image is truncated"})
     assert finding.is_fatal
-    assert "1 left out: image is truncated" in finding.said
+    assert "1 left out: image is truncated" in finding.message
     assert finding.concern == (
         "12 usable frames, and 20 are needed to train on some and to test on others (1 left out: image is truncated; "
         "1 poses without an image, as of b; 5 images without a pose, as 0.png, 1.png, 2.png, ...)"
@@ -184,7 +184,7 @@ def test_too_few_frames_are_fatal():
 def test_what_is_missing_is_told():
     capture = capture_of(poses_at(line(30)), poses_without_image=("a", "b"), images_without_pose=(Path("x.png"),))
     finding = sanity.check_missing(capture)
-    assert finding.said == "2 without image, 1 images without pose (a, b)"
+    assert finding.message == "2 without image, 1 images without pose (a, b)"
     assert not finding.concern
     assert (
         "4 of 34 poses have no image"
@@ -194,7 +194,7 @@ def test_what_is_missing_is_told():
 
 def test_sizes_that_differ_are_told():
     finding = sanity.check_sizes([(64, 48)] * 3 + [(48, 64)])
-    assert finding.said == "64x48 (3), 48x64 (1)"
+    assert finding.message == "64x48 (3), 48x64 (1)"
     assert finding.concern
 
 

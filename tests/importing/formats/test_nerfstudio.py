@@ -352,7 +352,7 @@ def test_no_image_is_there(write, tmp_path):
 
 def test_more_frames_than_a_scene_may_have(write, tmp_path, monkeypatch):
     write()
-    monkeypatch.setattr("mambaloc.importing.formats.builder.MOST_FRAMES", 1)
+    monkeypatch.setattr("mambaloc.importing.formats.builder.MAX_FRAMES", 1)
     with pytest.raises(InputError, match="lists 2 frames, more than 1; keep fewer"):
         read_capture(tmp_path)
 

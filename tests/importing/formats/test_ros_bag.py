@@ -184,7 +184,7 @@ def islands(bag, drive):
     [
         (two_of_each, None, "has poses in /odom, /tf. Choose one with --pose-topic NAME"),
         (two_of_each, BagTopics(poses="/up"), "--pose-topic /up: the bag has no poses there"),
-        (two_of_each, BagTopics(pictures="/up"), "--topic /up"),
+        (two_of_each, BagTopics(images="/up"), "--topic /up"),
         (islands, None, "no transform links the frames 'base_link' and 'camera_optical'"),
         (write_pictures, None, "nothing says where the camera 'camera_optical' was"),
         (lambda bag, drive: (write_pictures(bag, drive), write_poses(bag, drive, "pose")), None, "--pose-frame"),

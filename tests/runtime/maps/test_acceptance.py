@@ -20,14 +20,14 @@ def test_more_evidence_makes_a_pose_likelier():
     assert Evidence(9, 0.02, 2.0).probability > base
     assert Evidence(8, 0.01, 2.0).probability > base
     assert Evidence(8, 0.02, 1.0).probability > base
-    assert logit(Evidence(16, 0.003, 0.2).probability) > logit(acceptance.LEAST_PROBABILITY) > logit(base) - 4
+    assert logit(Evidence(16, 0.003, 0.2).probability) > logit(acceptance.MIN_PROBABILITY) > logit(base) - 4
 
 
 def test_a_likely_pose_that_is_not_precise_is_not_enough():
-    most = acceptance.MOST_DEVIATION
+    most = acceptance.MAX_DEVIATION
     assert Evidence(16, most, 0.1).is_enough
     assert not Evidence(16, 1.01 * most, 0.1).is_enough
-    assert Evidence(16, 1.01 * most, 0.1).probability > acceptance.LEAST_PROBABILITY
+    assert Evidence(16, 1.01 * most, 0.1).probability > acceptance.MIN_PROBABILITY
     assert not Evidence(2, 0.01, 5.0).is_enough
     assert not Evidence(16, np.nan, 0.1).is_enough
 

@@ -20,11 +20,11 @@ _POINTS_INSIDE = (0.01, 0.99)  # of the depths
 _MARGIN = 1.3
 _TRIAL_FRAMES, _TRIAL_OTHERS = 6, 1
 _TRIAL_RANGE = (0.2, 40.0)  # of how far the cameras are spread
-_LEAST_KNOWN = 0.05
+_MIN_KNOWN = 0.05
 _AT_ONCE = 128  # images that are mapped
 
 
-def depth_from_pictures(
+def depth_from_images(
     images: NDArray[np.uint8],
     intrinsics: Floats,
     world_from_cam: Floats,
@@ -49,14 +49,14 @@ def depth_from_pictures(
     """
     small, matrices = searched(images, intrinsics)
     if points_m is None:
-        range_m = range_from_pictures(small, matrices, world_from_cam, device)
+        range_m = range_from_images(small, matrices, world_from_cam, device)
     else:
         range_m = range_of_points(points_m, intrinsics, world_from_cam, images.shape[2:])
     sweep = PlaneSweep(small, matrices, world_from_cam, range_m, settings, device)
     rows = spread_rows(world_from_cam, sweep.scale_m, key_frames)
     depth_m = enlarged(sweep.depth_m(rows), images.shape[2:])
     found = confirmed(PosedDepth(images[rows], depth_m, intrinsics[rows], world_from_cam[rows]))
-    if np.isfinite(found.depth_m).mean() < _LEAST_KNOWN:
+    if np.isfinite(found.depth_m).mean() < _MIN_KNOWN:
         raise InputError(
             f"{len(images)} images: several images confirm no depth. Check poses and cameras, or do without views."
         )
@@ -101,7 +101,7 @@ def range_of_points(
     return near_m / _MARGIN, far_m * _MARGIN
 
 
-def range_from_pictures(
+def range_from_images(
     images: NDArray[np.uint8], intrinsics: Floats, world_from_cam: Floats, device: torch.device | str = "cpu"
 ) -> tuple[float, float]:
     """Nearest and farthest depth that a few images confirm, searched within what the cameras' spread suggests.

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 
-from mambaloc.files import whole_file
+from mambaloc.files import atomic_file
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -24,5 +24,5 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         content = io.BytesIO()  # torch, writing to a file that cannot grow, ends in an error of its own
         torch.save(checkpoint, content)
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(Path(path)) as partial:
+        with atomic_file(Path(path)) as partial:
             partial.write_bytes(content.getbuffer())
