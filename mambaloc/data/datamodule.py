@@ -118,7 +118,7 @@ class PoseDataModule(L.LightningDataModule):
         for several in ("scenes", "scene_share"):  # of a recipe's data; this is one scene
             self.hparams.pop(several, None)
         self.scene = Scene(**{field.name: self.hparams[field.name] for field in fields(Scene)})
-        # LightningCLI has given what the recipe says; what is kept, and told, is what that means.
+        # LightningCLI has given what the recipe says; what is kept and described is what that means.
         self.hparams.update(dataset=self.scene.dataset, root=self.scene.root, scene=self.scene.scene)
         self.crop = self.scene.crop
         self.jitter = Jitter(brightness, contrast, saturation)
