@@ -43,6 +43,13 @@ def _without_chatter(message: str) -> str:
 _REFUSING = ("lightning", "lightning_utilities", "jsonargparse")  # this for what a recipe's class raises when built
 
 
+def _our_refusal(error: BaseException | None) -> InputError | None:
+    """Return the InputError that an error was raised from: jsonargparse makes a ValueError of what a class raises."""
+    while error is not None and not isinstance(error, InputError):
+        error = error.__cause__ or error.__context__
+    return error
+
+
 @contextmanager
 def report_refusals(argv: list[str]) -> Iterator[None]:
     """Raise what Lightning itself refuses in the block, such as a trainer's option, in one line.
@@ -51,8 +58,8 @@ def report_refusals(argv: list[str]) -> Iterator[None]:
         argv: the command's words, of which the option is named.
 
     Raises:
-        InputError: for an error that Lightning's own code raises. What looks like a mistake in a program is raised as
-            it is.
+        InputError: for an error that Lightning's own code raises, and our own where jsonargparse wrapped it. What looks
+            like a mistake in a program is raised as it is.
     """
     try:
         yield
@@ -62,6 +69,8 @@ def report_refusals(argv: list[str]) -> Iterator[None]:
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
         if frame.f_globals.get("__name__", "").partition(".")[0] not in _REFUSING:
             raise
+        if ours := _our_refusal(error):
+            raise ours from error
         reason, line = _without_chatter(str(error)), traceback.extract_tb(error.__traceback__)[-1].line
         options = [word[2:].partition("=")[0] for word in argv if word.startswith("--") and "." in word]
         named = [name for name in options if name.partition(".")[2].rstrip("+") in f"{reason} {line}"]

@@ -31,6 +31,7 @@ from mambaloc.importing.formats import (
 )
 from mambaloc.importing.formats.ros_bag import BagTopics
 from mambaloc.importing.sfm import structure
+from mambaloc.importing.video import VIDEO_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,8 @@ def read_capture(
     if kind is not None and kind not in FORMATS:
         raise InputError(f"unknown --format {kind}; choose one of {', '.join(FORMATS)}")
     kind = kind or next((name for name, known in FORMATS.items() if known.matches(source)), None)
+    if kind is None and source.is_dir() and any(each.suffix.lower() in VIDEO_SUFFIXES for each in source.iterdir()):
+        raise InputError(f"{source}: holds videos, and an import takes one. Give one of them, or join them into one.")
     if kind is None:
         known = "; ".join(f"{name}: {each.looks_like}" for name, each in FORMATS.items())
         raise InputError(f"{source}: the format is not recognized ({known}). Give --format.")

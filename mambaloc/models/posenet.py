@@ -92,8 +92,8 @@ class GoogLeNetBackbone(ImageBackbone):
                 body.load_state_dict(GoogLeNet_Weights.IMAGENET1K_V1.get_state_dict(), strict=False)
             except OSError as error:
                 raise InputError(
-                    f"backbone_weights: torchvision's weights of GoogLeNet could not be fetched "
-                    f"({type(error).__name__}); name a local .safetensors file instead, or null to start from scratch"
+                    f"model.backbone_weights: torchvision's weights of GoogLeNet could not be fetched "
+                    f"({type(error).__name__}). Name a local .safetensors file instead, or null to start from scratch."
                 ) from error
 
     def forward(self, image: Tensor) -> Tensor:

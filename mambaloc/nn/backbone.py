@@ -203,8 +203,8 @@ def _timm_model(name: str, weights: str | None, timm_args: dict[str, Any] | None
         if weights != "timm":
             raise InputError(f"backbone {name!r}: timm cannot build it with {timm_args} ({error})") from error
         raise InputError(
-            f"backbone_weights: timm's weights of {name} could not be fetched ({type(error).__name__}); "
-            "name a local .safetensors file instead, or null to start from scratch"
+            f"model.backbone_weights: timm's weights of {name} could not be fetched ({type(error).__name__}). "
+            "Connect to the Internet, name a local .safetensors file, or null to start from scratch."
         ) from error
 
 

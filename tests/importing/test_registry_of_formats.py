@@ -130,6 +130,11 @@ def test_a_stranger_is_taken_for_none(tmp_path, refused, files):
     refused(read_capture, tmp_path, "the format is not recognized")
 
 
+def test_a_folder_of_videos_is_told_that_an_import_takes_one(tmp_path, refused):
+    (tmp_path / "one.mp4").touch(), (tmp_path / "two.MOV").touch()
+    refused(read_capture, tmp_path, "holds videos, and an import takes one")
+
+
 def test_every_format_is_tried_here():
     others = {
         "csv_world_from_cam",

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import timm
 import torch
 from lightning import Trainer
 
@@ -89,6 +90,26 @@ def test_only_what_lightning_refuses_is_a_users_mistake():
         Trainer(max_epochs=-2, logger=False)
     with pytest.raises(ValueError, match="ours"), report_refusals(["--trainer.max_epochs"]):
         raise ValueError("ours")
+
+
+def test_weights_that_cannot_be_fetched_are_named_with_their_option(tiny_recipe, monkeypatch, capsys):
+    """jsonargparse raises a ValueError from the InputError of a system that it builds."""
+    create = timm.create_model
+
+    def offline(*args, pretrained=False, **kwargs):
+        if pretrained:
+            raise OSError("no network")
+        return create(*args, **kwargs)
+
+    monkeypatch.setattr(timm, "create_model", offline)
+    with pytest.raises(SystemExit) as exit_:
+        main([str(tiny_recipe), "--model.backbone_weights", "timm"])
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: model.backbone_weights: ")
+    assert "safetensors" in error
+    assert "Lightning" not in error
+    assert len(error.strip().splitlines()) == 1
 
 
 @pytest.mark.slow
