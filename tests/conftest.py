@@ -23,6 +23,21 @@ settings.register_profile("nightly", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
+@pytest.fixture
+def offline_timm(monkeypatch):
+    """timm without a network: pretrained weights cannot be fetched."""
+    import timm
+
+    create = timm.create_model
+
+    def offline(*args, pretrained=False, **kwargs):
+        if pretrained:
+            raise OSError("no network")
+        return create(*args, **kwargs)
+
+    monkeypatch.setattr(timm, "create_model", offline)
+
+
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
     """``shared_folder(name, make)``: the folder of a name, which ``make(folder)`` fills once for all xdist workers."""

@@ -31,11 +31,15 @@ def test_without_torch_a_name_says_what_to_install():
     assert ended.stderr.endswith("mambaloc.load needs PyTorch. Run: pip install 'mambaloc[train]'\n")
 
 
-@pytest.mark.parametrize(("pattern", "expected"), [("*", 2), ("student.*", 1), ("*loc*", 1), ("nothing*", 0)])
-def test_released_models_are_listed_by_wildcard(pattern, expected):
+@pytest.mark.parametrize(
+    ("pattern", "systems"),
+    [("student.*", ["student"]), ("*loc.*", ["atloc", "denseloc", "mambaloc"]), ("nothing*", [])],
+)
+def test_released_models_are_listed_by_wildcard(pattern, systems):
     names = mambaloc.list_models(pattern, pretrained=True)
-    assert len(names) == expected
-    assert set(names) <= set(mambaloc.list_released())
+    assert names == [f"{system}.embedded_room" for system in systems]
+    assert set(names) <= set(mambaloc.list_models("*", pretrained=True))
+    assert mambaloc.list_models("*", pretrained=True) == mambaloc.list_released()
 
 
 def test_a_released_model_is_created_with_its_weights():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,7 @@ class ViewRefresh(L.Callback):
         if not self.every_n_epochs or (trainer.current_epoch + 1) % self.every_n_epochs or not len(data.view_rows):
             return
         if self._coming is not None:
-            self._coming.result()
+            wait([self._coming])  # where the process has failed, the views are made here
             self._put(trainer, self.rounds[-1])
         self.rounds.append(self._choose(trainer, pl_module))
         self._order(trainer, self.rounds[-1])
@@ -123,7 +124,8 @@ class ViewRefresh(L.Callback):
 
     def _order(self, trainer: L.Trainer, wanted: Round) -> None:
         """Let the process beside the training make a round's views."""
-        if self._pool is None:  # not forked: threads of a training may hold locks
+        has_died = self._coming is not None and isinstance(self._coming.exception(), BrokenProcessPool)
+        if self._pool is None or has_died:  # not forked: threads of a training may hold locks
             self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), torch.set_num_threads, (1,))
         self._coming = self._pool.submit(make_views, *_arguments(trainer, wanted))
 
@@ -150,7 +152,7 @@ def _arguments(trainer: L.Trainer, wanted: Round) -> tuple[Any, ...]:
 
 def _refuse(trainer: L.Trainer, module: L.LightningModule) -> None:
     data = trainer.datamodule  # type: ignore[attr-defined]
-    keeps_features = module.hparams["feature_cache_gib"]
+    keeps_features = module.hparams.get("feature_cache_gib")
     for is_so, reason in (
         (len(data.each_scene()) > 1, "data.scenes: views are replaced in one scene. Name one"),
         (trainer.world_size > 1, "trainer.devices: views are replaced on one device. Choose one"),

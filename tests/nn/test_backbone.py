@@ -172,15 +172,7 @@ def test_weights_that_lack_tensors_are_refused_and_one_named(tmp_path):
     )
 
 
-def test_timm_weights_that_cannot_be_fetched_are_one_line(monkeypatch):
-    create = timm.create_model
-
-    def offline(*args, pretrained=False, **kwargs):
-        if pretrained:
-            raise OSError("no network")
-        return create(*args, **kwargs)
-
-    monkeypatch.setattr(timm, "create_model", offline)
+def test_timm_weights_that_cannot_be_fetched_are_one_line(offline_timm):
     refused("could not be fetched", weights="timm")
 
 

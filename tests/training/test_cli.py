@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import timm
 import torch
 from lightning import Trainer
 
@@ -92,16 +91,8 @@ def test_only_what_lightning_refuses_is_a_users_mistake():
         raise ValueError("ours")
 
 
-def test_weights_that_cannot_be_fetched_are_named_with_their_option(tiny_recipe, monkeypatch, capsys):
+def test_weights_that_cannot_be_fetched_are_named_with_their_option(tiny_recipe, offline_timm, capsys):
     """jsonargparse raises a ValueError from the InputError of a system that it builds."""
-    create = timm.create_model
-
-    def offline(*args, pretrained=False, **kwargs):
-        if pretrained:
-            raise OSError("no network")
-        return create(*args, **kwargs)
-
-    monkeypatch.setattr(timm, "create_model", offline)
     with pytest.raises(SystemExit) as exit_:
         main([str(tiny_recipe), "--model.backbone_weights", "timm"])
     assert exit_.value.code == 2
