@@ -6,7 +6,7 @@ import cv2
 import maps_robustness
 import numpy as np
 import pytest
-from maps_colmap import ColmapRoute, Pictures
+from maps_colmap import ColmapRoute, WrittenImages
 from maps_disturbances import DISTURBANCES, exposure, motion_blur, occlusion, smaller
 from maps_report import summarize, table, write_result
 from maps_robustness import Answers, compare, measure, wilson_interval
@@ -224,7 +224,9 @@ def test_a_map_alone_is_measured(room):
 def test_colmap_localizes_in_the_same_room(room, tmp_path):
     """Its pose within 5 cm shows that pixels, cameras and poses are handed over in COLMAP's conventions."""
     key, queries = room
-    shown, asked = (Pictures.write(each, SIZE[0], tmp_path / name) for each, name in ((key, "key"), (queries, "query")))
+    shown, asked = (
+        WrittenImages.write(each, SIZE[0], tmp_path / name) for each, name in ((key, "key"), (queries, "query"))
+    )
     (tmp_path / "work").mkdir()
     route = ColmapRoute(shown, tmp_path / "work")
     route.build()
