@@ -21,14 +21,12 @@ from mambaloc.metrics import error_table
 from mambaloc.synthesis import Spread, Views, make_views
 
 _FOLDER = "views"
-_RAD = torch.pi / 180
 
 
 @dataclass(frozen=True)
 class Round:
     """New views for the place of some: about which poses, (K, 4, 4), in which rows, (N,) of N views."""
 
-    number: int
     rows: NDArray[np.int64]
     world_from_cam: NDArray[np.float64]
 
@@ -71,10 +69,7 @@ class ViewRefresh(L.Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take over the rounds of a checkpoint."""
-        self.rounds = [
-            Round(number, each["rows"].numpy(), each["world_from_cam"].numpy())
-            for number, each in enumerate(state_dict["rounds"])
-        ]
+        self.rounds = [Round(each["rows"].numpy(), each["world_from_cam"].numpy()) for each in state_dict["rounds"]]
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Repeat the rounds of a resumed run.
@@ -85,10 +80,10 @@ class ViewRefresh(L.Callback):
         if not self.every_n_epochs:
             return
         _refuse(trainer, pl_module)
-        for each in self.rounds[:-1]:
-            self._put(trainer, each)
+        for number in range(len(self.rounds) - 1):
+            self._put(trainer, number)
         if self.rounds:
-            self._order(trainer, self.rounds[-1])
+            self._order(trainer)
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """End a round and begin the next one, where one is due."""
@@ -97,9 +92,9 @@ class ViewRefresh(L.Callback):
             return
         if self._coming is not None:
             wait([self._coming])  # where the process has failed, the views are made here
-            self._put(trainer, self.rounds[-1])
+            self._put(trainer, len(self.rounds) - 1)
         self.rounds.append(self._choose(trainer, pl_module))
-        self._order(trainer, self.rounds[-1])
+        self._order(trainer)
 
     def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         """Stop the process beside the training."""
@@ -109,45 +104,45 @@ class ViewRefresh(L.Callback):
 
     def _choose(self, trainer: L.Trainer, module: L.LightningModule) -> Round:
         """Localize views, and find the best and the worst."""
-        data, number = trainer.datamodule, len(self.rounds)  # type: ignore[attr-defined]
-        rng, views = np.random.default_rng((provenance.seed(), number)), data.view_rows
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        rng, views = np.random.default_rng((provenance.seed(), len(self.rounds))), data.view_rows
         rows = rng.choice(views, min(self.measured, len(views)), replace=False)
         batches = data.training_batches(rows, trainer.current_epoch, data.hparams["eval_batch_size"])
         module.eval()
         with torch.no_grad():
             errors = error_table(module, batches)
         module.train()
-        error = errors.position_error_m / _made(trainer).source.median_depth_m + errors.rotation_error_deg * _RAD
+        error = errors.position_error_m / _made(trainer).source.median_depth_m + errors.rotation_error_deg.deg2rad()
         order = errors.index[error.argsort()].cpu().numpy()
         count = min(self.replaced, len(order) // 2)
-        return Round(number, order[:count], data.poses_of_rows(order[-count:]))
+        return Round(order[:count], data.poses_of_rows(order[-count:]))
 
-    def _order(self, trainer: L.Trainer, wanted: Round) -> None:
-        """Let the process beside the training make a round's views."""
+    def _order(self, trainer: L.Trainer) -> None:
+        """Let the process beside the training make the last round's views."""
         has_died = self._coming is not None and isinstance(self._coming.exception(), BrokenProcessPool)
         if self._pool is None or has_died:  # not forked: threads of a training may hold locks
             self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), torch.set_num_threads, (1,))
-        self._coming = self._pool.submit(make_views, *_arguments(trainer, wanted))
+        self._coming = self._pool.submit(make_views, *self._arguments(trainer, len(self.rounds) - 1))
 
-    def _put(self, trainer: L.Trainer, made: Round) -> None:
-        views = make_views(*_arguments(trainer, made))  # opens them, unless a moved run has lost them
-        trainer.datamodule.replace_views(made.rows, views)  # type: ignore[attr-defined]
+    def _put(self, trainer: L.Trainer, number: int) -> None:
+        """Train on a round's views from now on."""
+        views = make_views(*self._arguments(trainer, number))  # opens them, unless a moved run has lost them
+        trainer.datamodule.replace_views(self.rounds[number].rows, views)  # type: ignore[attr-defined]
+
+    def _arguments(self, trainer: L.Trainer, number: int) -> tuple[Any, ...]:
+        """What :func:`~mambaloc.synthesis.make_views` takes to make a round's views."""
+        wanted, made = self.rounds[number], _made(trainer)
+        views: Views = made.views  # type: ignore[assignment]
+        return (
+            made.source, wanted.world_from_cam, views.intrinsics[0], views.images.shape[2:], len(wanted.rows),
+            Path(trainer.default_root_dir) / _FOLDER, provenance.seed() + 1 + number, Spread(far=1.0),
+            trainer.strategy.root_device,
+        )  # fmt: skip
 
 
 def _made(trainer: L.Trainer) -> SceneViews:
     made: SceneViews = trainer.datamodule.scene_views  # type: ignore[attr-defined]
     return made
-
-
-def _arguments(trainer: L.Trainer, wanted: Round) -> tuple[Any, ...]:
-    """What :func:`~mambaloc.synthesis.make_views` takes."""
-    made = _made(trainer)
-    views: Views = made.views  # type: ignore[assignment]
-    return (
-        made.source, wanted.world_from_cam, views.intrinsics[0], views.images.shape[2:], len(wanted.rows),
-        Path(trainer.default_root_dir) / _FOLDER, provenance.seed() + 1 + wanted.number, Spread(far=1.0),
-        trainer.strategy.root_device,
-    )  # fmt: skip
 
 
 def _refuse(trainer: L.Trainer, module: L.LightningModule) -> None:

@@ -199,10 +199,11 @@ class PoseDataModule(L.LightningDataModule):
 
     def replace_views(self, rows: NDArray[np.int64], views: Views) -> None:
         """Train on N views in place of those in N of the :attr:`view_rows`, from the next batch on."""
-        for data in {id(each): each for each in (self.scene.items("train"), self._data("train"))}.values():
+        frames = self.scene.items("train")
+        count = 0 if frames.points_m is None else frames.points_m.shape[1]
+        points = points_of_views(views, count, provenance.seed()) if count else None
+        for data in {id(each): each for each in (frames, self._data("train"))}.values():  # the device's copy, too
             if isinstance(data, FramesAndViews):
-                count = 0 if data.points_m is None else data.points_m.shape[1]
-                points = points_of_views(views, count, provenance.seed()) if count else None
                 data.replace_views(rows, views, points)
 
     def training_batches(self, rows: NDArray[np.int64], epoch: int, size: int) -> Iterator[PoseBatch]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from copy import copy
 from typing import Self
 
@@ -59,17 +60,21 @@ class ViewPool:
     def images(self, places: Rows) -> NDArray[np.uint8]:
         """Images of some views, (B, 3, H, W)."""
         found = np.empty((len(places), *self.shape), np.uint8)
-        for at, place in enumerate(places):
-            found[at] = self._sets[self._set[place]].images[self._row[place]]
-        for each in self._sets:
-            release_pages(each.images)
+        for at, (views, row) in enumerate(self._found(places)):
+            found[at] = views.images[row]
+        for number in np.unique(self._set[places]):
+            release_pages(self._sets[number].images)
         return found
 
     def holes(self, places: Rows) -> NDArray[np.bool_]:
         """Which pixels of some views have no depth, (B, H, W)."""
         found = np.empty((len(places), *self.shape[1:]), dtype=bool)
-        for at, place in enumerate(places):
-            np.isnan(self._sets[self._set[place]].depth_m[self._row[place]], out=found[at])
-        for each in self._sets:
-            release_pages(each.depth_m)
+        for at, (views, row) in enumerate(self._found(places)):
+            np.isnan(views.depth_m[row], out=found[at])
+        for number in np.unique(self._set[places]):
+            release_pages(self._sets[number].depth_m)
         return found
+
+    def _found(self, places: Rows) -> Iterator[tuple[Views, int]]:
+        for number, row in zip(self._set[places].tolist(), self._row[places].tolist(), strict=True):
+            yield self._sets[number], row
