@@ -22,10 +22,10 @@ from mambaloc.export.maps import check_scene, describe_map, map_vector
 from mambaloc.export.onnx import contract_of_training, export_onnx
 from mambaloc.export.pages import write_pages
 from mambaloc.export.precision import half_precision, write_ort
-from mambaloc.export.preprocessing import with_preprocessing
+from mambaloc.export.preprocessing import ties_rounded_otherwise, with_preprocessing
 from mambaloc.export.quantization import QuantizedModel, eight_bit
 from mambaloc.files import atomic_folder, sha256
-from mambaloc.geometry import canonical
+from mambaloc.geometry import canonical, rotation_error_deg
 from mambaloc.images import Image, read_image
 from mambaloc.models import LitPoseRegressor
 from mambaloc.runtime.bundle import CONTRACT_FILE, Deviation, replay, verify_bundle
@@ -38,6 +38,8 @@ TRAJECTORY_FILE = "trajectory.json"
 _FRAMES = 5
 _ALLOWED = {"onnx": (1.0, 0.1), "ort": (1.0, 0.1), "fp16": (20.0, 1.0)}
 """Largest deviation in millimetres and degrees, per metre of the scene's size; int8 has a gate of its own."""
+_TIES_ALLOWED = 2.0
+"""Where the model resizes, that many times what a frame's pose changes by when all its ties are rounded the other way."""
 
 
 @dataclass(frozen=True)
@@ -203,13 +205,19 @@ def _network_vector(
     if contract.intrinsics is not None:
         preprocessing = contract.preprocessing_for(rgb.shape[:2], intrinsics)
         camera = torch.from_numpy(preprocessing.crop_from_image(rgb.shape[:2]) @ intrinsics).float()[None]
-    cropped = preprocessing.apply(rgb)
-    image = torch.from_numpy(np.ascontiguousarray(cropped.transpose(2, 0, 1)))[None].float() / 255
+    crops = np.stack([preprocessing.apply(rgb), ties_rounded_otherwise(rgb, preprocessing)])
+    images = torch.from_numpy(np.ascontiguousarray(crops.transpose(0, 3, 1, 2))).float() / 255
     with torch.inference_mode():
-        prediction = system.cpu().eval()(image, camera)
+        predictions = [system.cpu().eval()(image[None], camera) for image in images]
+    positions = [each.position_m[0].double() for each in predictions]
+    quaternions = [canonical(each.quaternion)[0] for each in predictions]
     return {
-        "position_m": prediction.position_m[0].tolist(),
-        "quaternion_wxyz": canonical(prediction.quaternion)[0].tolist(),
+        "position_m": predictions[0].position_m[0].tolist(),
+        "quaternion_wxyz": quaternions[0].tolist(),
+        "by_rounding": {
+            "position_mm": 1000 * float((positions[0] - positions[1]).norm()),
+            "rotation_deg": float(rotation_error_deg(*quaternions)),
+        },
     }
 
 
@@ -248,6 +256,9 @@ def _write_contract(
             files[MODEL_FILES[name]]["quantised"] = _in_figures(int8)
         else:
             allowed_mm, allowed_deg = _ALLOWED[name][0] * size_m, _ALLOWED[name][1]
+            if contract.preprocessing.in_model:
+                allowed_mm += _TIES_ALLOWED * max(frame["by_rounding"]["position_mm"] for frame in frames)
+                allowed_deg += _TIES_ALLOWED * max(frame["by_rounding"]["rotation_deg"] for frame in frames)
         files[MODEL_FILES[name]]["allowed"] = {"position_mm": allowed_mm, "rotation_deg": allowed_deg}
     bundle = {**json.loads(contract.to_json()), **described_map, "files": files, "frames": frames}
     (folder / CONTRACT_FILE).write_text(json.dumps(bundle, indent=2) + "\n", encoding="utf-8")

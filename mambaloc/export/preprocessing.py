@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import onnx
 
+from mambaloc.images import Image, resized_size
 from mambaloc.runtime.contract import IMAGE_INPUT, INTRINSICS_INPUT, MAX_ENLARGEMENT, RAW_INPUT, Preprocessing
 
 _PREFIX = "preprocessing_"  # of the names inside
+_TIE = 2e-4  # levels from halfway
 
 
 def with_preprocessing(
@@ -84,6 +87,21 @@ def with_preprocessing(
         for node in merged.graph.node:
             node.input[:] = [tensor.name if name == prefixed else name for name in node.input]
     return merged
+
+
+def ties_rounded_otherwise(rgb: Image, preprocessing: Preprocessing) -> Image:
+    """Preprocess an image, and round each level halfway between two whole ones the other way; (H, W, 3) -> (*crop, 3).
+
+    In float32 the order of a sum decides such a level, and no two processors or libraries add in the same order. Images
+    that become 2, 4, 8 ... times smaller have weights that a float32 holds exactly, and no such levels.
+    """
+    new = resized_size(rgb.shape[:2], preprocessing.short_side)
+    if all(old % size == 0 and (old // size).bit_count() == 1 for old, size in zip(rgb.shape[:2], new, strict=True)):
+        return preprocessing.apply(rgb)
+    rounded, exact = preprocessing.apply(rgb), preprocessing.apply(rgb.astype(np.float32))
+    below = np.floor(exact)
+    is_tie = np.abs(exact - below - 0.5) < _TIE
+    return np.where(is_tie, 2 * below + 1 - rounded, rounded).clip(0, 255).astype(np.uint8)
 
 
 _CROP = """

@@ -5,7 +5,7 @@ import onnx
 import onnxruntime
 import pytest
 
-from mambaloc.export.preprocessing import with_preprocessing
+from mambaloc.export.preprocessing import ties_rounded_otherwise, with_preprocessing
 from mambaloc.runtime.contract import Preprocessing
 
 
@@ -35,3 +35,22 @@ def test_levels_are_opencvs(size, short_side, worst_share):
     off = np.abs(levels - preprocessing.apply(image))
     assert off.max() <= 1
     assert (off > 0).mean() <= worst_share
+
+
+def test_ties_are_the_levels_halfway_in_whole_numbers():
+    """400 pixels become 90: an old pixel is 9 parts, a new one 40, so a level is a whole number over 1600."""
+    overlaps = np.repeat(np.eye(90, dtype=int), 40, axis=1).reshape(90, 400, 9).sum(axis=2)
+    image = np.random.default_rng(0).integers(0, 256, (400, 400, 3), dtype=np.uint8)
+    parts = np.stack([overlaps @ channel @ overlaps.T for channel in image.astype(int).transpose(2, 0, 1)], axis=2)
+    preprocessing = Preprocessing(90, (90, 90))
+    rounded, otherwise = preprocessing.apply(image).astype(int), ties_rounded_otherwise(image, preprocessing).astype(int)
+    is_tie = parts % 1600 == 800
+    assert is_tie.sum() > 10
+    np.testing.assert_array_equal(rounded != otherwise, is_tie)
+    np.testing.assert_array_equal((rounded + otherwise)[is_tie], 2 * (parts // 1600)[is_tie] + 1)
+
+
+def test_a_power_of_two_has_no_ties():
+    image = np.random.default_rng(0).integers(0, 256, (144, 192, 3), dtype=np.uint8)
+    preprocessing = Preprocessing(36, (36, 40))
+    np.testing.assert_array_equal(ties_rounded_otherwise(image, preprocessing), preprocessing.apply(image))
