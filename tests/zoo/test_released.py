@@ -8,6 +8,7 @@ import mambaloc
 from mambaloc.data import PoseDataModule
 from mambaloc.evaluation.predict import localize_test_frames
 from mambaloc.metrics import summarize
+from mambaloc.models.registry import model_class
 from mambaloc.zoo import Manifest, list_released
 
 ZOO = Path(__file__).parents[2] / "zoo"
@@ -17,7 +18,9 @@ NAMES = sorted(path.name for path in ZOO.iterdir() if path.is_dir())
 SHOWN = ("denseloc.embedded_room", "student.embedded_room")  # by the page, and where nothing is named
 
 
-def test_they_are_small():
+def test_every_system_is_released_and_small():
+    ours = [name for name in mambaloc.list_models() if model_class(name).__module__.startswith("mambaloc.")]
+    assert [f"{system}.embedded_room" for system in ours] == NAMES
     assert set(NAMES) <= set(list_released())
     for name in NAMES:
         assert sum(file.stat().st_size for file in (ZOO / name).iterdir()) < 8e6
