@@ -179,7 +179,11 @@ class LitPoseRegressor(L.LightningModule):
 
     @property
     def backbone_arguments(self) -> dict[str, Any]:
-        """What the hyperparameters say of the backbone, as ``mambaloc.nn``'s backbones take it."""
+        """The hyperparameters of the backbone, by the names that ``mambaloc.nn``'s backbones have for them.
+
+        ``name`` is the hyperparameter ``backbone``, ``weights`` is ``backbone_weights``, ``timm_args`` is
+        ``backbone_args``; ``pixel_mean`` and ``pixel_std`` keep their names.
+        """
         return {theirs: self.hparams[ours] for theirs, ours in BACKBONE_ARGUMENTS.items()}
 
     def hyperparameters_of(self, network: type[nn.Module]) -> dict[str, Any]:

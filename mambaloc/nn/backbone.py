@@ -119,6 +119,10 @@ class Backbone(ImageBackbone):
     Shape:
         image (B, 3, H, W) in 0..1 -> one (B, channels[i], ~H / strides[i], ~W / strides[i]) a stride.
 
+    Attributes:
+        strides: of the maps, as they were asked for.
+        channels: of the maps, in the same order.
+
     Raises:
         InputError: for an unknown model, strides that it does not have, or weights that do not fit.
     """
@@ -168,6 +172,9 @@ class PooledBackbone(ImageBackbone):
 
     Shape:
         image (B, 3, H, W) in 0..1 -> (B, width).
+
+    Attributes:
+        width: of the feature.
 
     Raises:
         InputError: for an unknown model or weights that do not fit.

@@ -57,6 +57,12 @@ def test_a_system_of_another_package_trains_and_is_evaluated(tmp_path, den):
     assert done.stdout.startswith("['branchnet']")
     assert (tmp_path / "results/metrics.json").is_file()
 
+    (tmp_path / "test_branchnet.py").write_text(blocks(page, "python")[1].text)
+    words = ["-c", program.splitlines()[0] + "\nimport pytest; sys.exit(pytest.main(['-q', 'test_branchnet.py']))"]
+    done = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "3 passed" in done.stdout
+
 
 def test_the_phone_app_refuses_and_takes_another_lens(workspace, mambaloc, capsys):
     """``docs/phone_app.md``: an image of another shape is refused in the page's words, and localized by its intrinsics.

@@ -35,7 +35,7 @@ def locate(dataset: str, root: str | None, scene: str) -> tuple[str, str | None,
     A folder of that name in the root comes first; then, if the name is a path and not a plain name, the folder there.
 
     Returns:
-        The three, changed where the scene is an imported one.
+        The three, changed where the scene is an imported one, or the embedded one, which has one name.
     """
     for folder in (Path(root, scene) if root else None, Path(scene) if Path(scene).name != scene else None):
         if folder is not None and folder.is_dir():
@@ -43,6 +43,10 @@ def locate(dataset: str, root: str | None, scene: str) -> tuple[str, str | None,
                 break
             folder = folder if folder.name not in ("", "..") else folder.resolve()
             return CAPTURE, str(folder.parent), folder.name
+    if dataset == EMBEDDED:  # it has one scene, whatever the default of other datasets
+        from mambaloc.rendering.scenes.embedded import EMBEDDED_SCENE
+
+        return dataset, root, EMBEDDED_SCENE
     return dataset, root, scene
 
 

@@ -194,6 +194,7 @@ def test_where_a_path_leads(scene, tmp_path, monkeypatch):
         assert locate("7scenes", None, name) == expected
     assert locate("7scenes", "scenes", "den") == expected
     assert locate("7scenes", None, "heads") == ("7scenes", None, "heads")
+    assert locate("embedded", None, "heads") == ("embedded", None, "room")  # heads is the default of all datasets
     monkeypatch.chdir(tmp_path / "scenes")
     assert locate("7scenes", None, "den") == ("7scenes", None, "den")  # a plain name is one of the dataset's scenes
     assert locate("7scenes", None, "./den") == ("capture", ".", "den")
