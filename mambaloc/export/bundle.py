@@ -39,7 +39,7 @@ _FRAMES = 5
 _ALLOWED = {"onnx": (1.0, 0.1), "ort": (1.0, 0.1), "fp16": (20.0, 1.0)}
 """Largest deviation in millimetres and degrees, per metre of the scene's size; int8 has a gate of its own."""
 _TIES_ALLOWED = 2.0
-"""Where the model resizes, that many times what a frame's pose changes by when all its ties are rounded the other way."""
+"""Where the model resizes: that many times the change of a frame's pose when all its ties are rounded the other way."""
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ def test_every_model_finds_what_pytorch_finds(bundle):
 
 @pytest.mark.slow
 def test_a_network_that_one_grey_level_moves_gets_its_bundle(student, data, tmp_path):
-    """Trained for a minute, a network's pose may change by millimetres with the few levels that any resize may round."""
+    """Of a network trained for a minute, a few levels that any resize may round change the pose by millimetres."""
     unsteady = copy.deepcopy(student)
     with torch.no_grad():
         unsteady.network.backbone.model.conv1[0].weight *= 1000

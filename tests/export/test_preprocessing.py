@@ -43,7 +43,8 @@ def test_ties_are_the_levels_halfway_in_whole_numbers():
     image = np.random.default_rng(0).integers(0, 256, (400, 400, 3), dtype=np.uint8)
     parts = np.stack([overlaps @ channel @ overlaps.T for channel in image.astype(int).transpose(2, 0, 1)], axis=2)
     preprocessing = Preprocessing(90, (90, 90))
-    rounded, otherwise = preprocessing.apply(image).astype(int), ties_rounded_otherwise(image, preprocessing).astype(int)
+    rounded = preprocessing.apply(image).astype(int)
+    otherwise = ties_rounded_otherwise(image, preprocessing).astype(int)
     is_tie = parts % 1600 == 800
     assert is_tie.sum() > 10
     np.testing.assert_array_equal(rounded != otherwise, is_tie)
