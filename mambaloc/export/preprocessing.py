@@ -43,7 +43,7 @@ def with_preprocessing(
             => (float[1, 3, {height}, {width}] network_input{passed_on})
         <
             {_camera_constants(preprocessing, focal_px) if focal_px else f"float short_side = {{{short_side}}},"}
-            float white = {{255.0}}, float one_f = {{1.0}}, float none = {{0.0}}, float two_f = {{2.0}},
+            float white = {{255.0}}, float none = {{0.0}}, float two_f = {{2.0}},
             float eighth = {{0.125}}, int64 zero = {{0}}, int64 one = {{1}},
             int64[1] first = {{0}}, int64[1] second = {{1}}, int64[1] third = {{2}}, int64[1] two = {{2}},
             int64[1] channels = {{3}}, int64[2] row_by_row = {{0, -1}},
@@ -153,13 +153,16 @@ _CROP_OF_CAMERA = """
 def _camera_constants(preprocessing: Preprocessing, focal_px: float) -> str:
     largest = float(MAX_ENLARGEMENT * preprocessing.short_side)
     return f"""
-            float focal = {{{focal_px}}}, float largest = {{{largest}}}, float half = {{0.5}}, int64[1] nine = {{9}},
+            float one_f = {{1.0}}, float focal = {{{focal_px}}}, float largest = {{{largest}}}, float half = {{0.5}}, int64[1] nine = {{9}},
             float[1] ones = {{1.0}}, float[1] nones = {{0.0}}, float[1, 3] last = {{0.0, 0.0, 1.0}},
             int64[2] x_after_y = {{1, 0}}, int64[2] column = {{3, 1}},"""
 
 
 def _overlaps(axis: str, begin: str, end: str) -> str:
-    """Share of each old pixel (columns) in each new one (rows): how far their extents overlap, by the new one's."""
+    """Share of each old pixel (columns) in each new one (rows): how far their extents overlap, by the new one's.
+
+    Old pixels are as many parts long as there are new ones, and the other way about: whole numbers, which float32 holds.
+    """
     return f"""
             {axis}_old_1 = Slice(size, {begin}, {end})
             {axis}_new_1 = Slice(new_size, {begin}, {end})
@@ -167,18 +170,18 @@ def _overlaps(axis: str, begin: str, end: str) -> str:
             {axis}_new = Squeeze({axis}_new_1)
             {axis}_old_f = Cast<to = 1>({axis}_old)
             {axis}_new_f = Cast<to = 1>({axis}_new)
-            {axis}_step = Div({axis}_old_f, {axis}_new_f)
             {axis}_j_int = Range(zero, {axis}_old, one)
-            {axis}_j_row = Cast<to = 1>({axis}_j_int)
-            {axis}_j = Unsqueeze({axis}_j_row, first)
-            {axis}_j_end = Add({axis}_j, one_f)
+            {axis}_j_float = Cast<to = 1>({axis}_j_int)
+            {axis}_j_row = Unsqueeze({axis}_j_float, first)
+            {axis}_j = Mul({axis}_j_row, {axis}_new_f)
+            {axis}_j_end = Add({axis}_j, {axis}_new_f)
             {axis}_i_int = Range(zero, {axis}_new, one)
-            {axis}_i_row = Cast<to = 1>({axis}_i_int)
-            {axis}_i_column = Unsqueeze({axis}_i_row, second)
-            {axis}_i = Mul({axis}_i_column, {axis}_step)
-            {axis}_i_end = Add({axis}_i, {axis}_step)
+            {axis}_i_float = Cast<to = 1>({axis}_i_int)
+            {axis}_i_column = Unsqueeze({axis}_i_float, second)
+            {axis}_i = Mul({axis}_i_column, {axis}_old_f)
+            {axis}_i_end = Add({axis}_i, {axis}_old_f)
             {axis}_from = Max({axis}_i, {axis}_j)
             {axis}_to = Min({axis}_i_end, {axis}_j_end)
             {axis}_signed = Sub({axis}_to, {axis}_from)
             {axis}_overlap = Max({axis}_signed, none)
-            {axis}_weight = Div({axis}_overlap, {axis}_step)"""
+            {axis}_weight = Div({axis}_overlap, {axis}_old_f)"""
