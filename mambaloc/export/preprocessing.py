@@ -153,7 +153,8 @@ _CROP_OF_CAMERA = """
 def _camera_constants(preprocessing: Preprocessing, focal_px: float) -> str:
     largest = float(MAX_ENLARGEMENT * preprocessing.short_side)
     return f"""
-            float one_f = {{1.0}}, float focal = {{{focal_px}}}, float largest = {{{largest}}}, float half = {{0.5}}, int64[1] nine = {{9}},
+            float one_f = {{1.0}},
+            float focal = {{{focal_px}}}, float largest = {{{largest}}}, float half = {{0.5}}, int64[1] nine = {{9}},
             float[1] ones = {{1.0}}, float[1] nones = {{0.0}}, float[1, 3] last = {{0.0, 0.0, 1.0}},
             int64[2] x_after_y = {{1, 0}}, int64[2] column = {{3, 1}},"""
 
@@ -161,7 +162,7 @@ def _camera_constants(preprocessing: Preprocessing, focal_px: float) -> str:
 def _overlaps(axis: str, begin: str, end: str) -> str:
     """Share of each old pixel (columns) in each new one (rows): how far their extents overlap, by the new one's.
 
-    Old pixels are as many parts long as there are new ones, and the other way about: whole numbers, which float32 holds.
+    Old pixels are as many parts long as there are new ones, and the other way about: whole numbers, exact in float32.
     """
     return f"""
             {axis}_old_1 = Slice(size, {begin}, {end})

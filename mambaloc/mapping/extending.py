@@ -111,7 +111,7 @@ def _pairs(
     cam_from_world = np.linalg.inv(world_from_cam)
     for first, second in pairs_by_pose(world_from_cam).tolist():
         rows = matched(first, second)
-        agree = agreeing(features, cam_from_world, np.array((first, second)), rows, near_px)
+        (agree,) = agreeing(features, cam_from_world, np.array([(first, second)]), [rows], near_px)
         if len(agree) > _MIN_AGREEING * len(rows):
             pairs.append((first, second))
             matches.append(agree[~is_known[first][agree[:, 0]] & ~is_known[second][agree[:, 1]]])

@@ -49,21 +49,29 @@ def sampson_distance(second_from_first: Floats, first: Floats, second: Floats) -
 
 
 def agreeing(
-    features: Sequence[Features], cam_from_world: Floats, pair: Indices, rows: Indices, near_px: float
-) -> Indices:
-    """Keep the matches of two frames that lie near their epipolar line.
+    features: Sequence[Features], cam_from_world: Floats, pairs: Indices, matches: Sequence[Indices], near_px: float
+) -> list[Indices]:
+    """Keep the matches that lie near their epipolar line, all pairs of frames at once.
 
     Args:
         features: of every frame.
         cam_from_world: of every frame, (N, 4, 4).
-        pair: two rows of frames.
-        rows: of keypoints of both, (M, 2).
+        pairs: rows of frames, (E, 2).
+        matches: rows of keypoints of both frames of each pair, (M, 2).
         near_px: how far from the line, in pixels of the frames as they were searched.
     """
-    first, second = (features[row] for row in pair)
-    second_from_first = cam_from_world[pair[1]] @ np.linalg.inv(cam_from_world[pair[0]])
-    off = sampson_distance(second_from_first, first.rays[rows[:, 0]], second.rays[rows[:, 1]])
-    return rows[off * first.intrinsics[0, 0] <= near_px]
+    if not len(pairs):
+        return []
+    first, second = (
+        np.concatenate([features[frame].rays[rows[:, side]] for frame, rows in zip(frames, matches, strict=True)])
+        for side, frames in enumerate(pairs.T)
+    )
+    counts = [len(rows) for rows in matches]
+    second_from_first = cam_from_world[pairs[:, 1]] @ np.linalg.inv(cam_from_world[pairs[:, 0]])
+    focal_px = np.array([features[frame].intrinsics[0, 0] for frame in pairs[:, 0]])
+    off = sampson_distance(np.repeat(second_from_first, counts, axis=0), first, second)
+    is_near = np.split(off * np.repeat(focal_px, counts) <= near_px, np.cumsum(counts)[:-1])
+    return [rows[near] for rows, near in zip(matches, is_near, strict=True)]
 
 
 def connected(count: int, edges: Indices) -> Indices:
