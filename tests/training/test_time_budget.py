@@ -1,5 +1,6 @@
 """Training for so many minutes, and the bundle that it ends with."""
 
+import re
 import time
 from types import SimpleNamespace
 
@@ -57,11 +58,15 @@ def test_the_time_before_the_first_step_and_the_reserve_are_part_of_the_budget(c
     assert logged == {"time/left_s": 0.0}
 
 
-def test_a_budget_ends_a_run_that_has_no_other_end(tiny_recipe, tmp_path):
+def test_a_budget_ends_a_run_that_has_no_other_end(tiny_recipe, tmp_path, capsys):
+    """Its progress bar names the epoch alone. Guess: Lightning's draws ``Epoch 0/-2``."""
     options = ["--trainer.max_epochs", "-1", "--time_budget.minutes", "0.25", "--time_budget.reserve_s", "1"]
     main([str(tiny_recipe), *options, "--trainer.default_root_dir", str(tmp_path / "run")])
     assert read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")["global_step"] > 5
     assert (tmp_path / "run/evaluation/last/metrics.json").is_file()
+    drawn = re.findall(r"Epoch (\S+)", capsys.readouterr().out)
+    assert drawn
+    assert all(epoch.isdecimal() for epoch in drawn)
 
 
 def test_a_budget_that_is_used_up_before_the_first_step(clock):
