@@ -95,7 +95,8 @@ class RecipeCLI(LightningCLI):
             parser.set_defaults(
                 {
                     f"{name}_checkpoint.filename": name,
-                    f"{name}_checkpoint.save_on_train_epoch_end": True,
+                    # The best is chosen after a validation: epochs without one have no value, or that of other weights.
+                    f"{name}_checkpoint.save_on_train_epoch_end": name == "last",
                     f"{name}_checkpoint.enable_version_counter": False,
                 }
             )

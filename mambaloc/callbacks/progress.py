@@ -42,3 +42,9 @@ class PoseProgressBar(RichProgressBar):
             medians = metrics["val/position_error_m"].item(), metrics["val/rotation_error_deg"].item()
             shown["val"] = "{:.3f} m {:.2f} deg".format(*medians)
         return shown
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        """Name the epoch; Lightning counts up to -2 where ``trainer.max_epochs`` is -1, without a limit."""
+        if self.trainer.max_epochs == -1:
+            return f"Epoch {current_epoch}".ljust(len(self.validation_description))
+        return super()._get_train_description(current_epoch)

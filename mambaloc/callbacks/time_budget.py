@@ -37,7 +37,8 @@ class TimeBudget(L.Callback):
     def __init__(self, minutes: float | None = None, reserve_s: float = 30.0) -> None:
         if minutes is not None and not reserve_s < 60 * minutes < math.inf:
             raise InputError(
-                f"time_budget.minutes {minutes:g}: must be more than the {reserve_s:g} s of time_budget.reserve_s"
+                f"time_budget.minutes {minutes:g}: must be a finite number above {reserve_s / 60:g}, since the last "
+                f"{reserve_s:g} s are for tests and export (time_budget.reserve_s). Give more minutes."
             )
         self.minutes, self.reserve_s = minutes, reserve_s
         self.began_s = time.monotonic()
@@ -53,9 +54,12 @@ class TimeBudget(L.Callback):
             return
         self._train_began, self._ends = time.monotonic(), self.began_s + 60 * self.minutes - self.reserve_s
         if self._ends <= self._train_began:
+            started_s = self._train_began - self.began_s
+            enough = math.ceil((started_s + self.reserve_s) / 6) / 10
             raise InputError(
-                f"time_budget.minutes {self.minutes:g}: {self._train_began - self.began_s:.0f} s went by before the "
-                "first step. Give more; frames, map and views are kept for the next run."
+                f"time_budget.minutes {self.minutes:g}: leaves no time to train. {started_s:.0f} s went by before the "
+                f"first step, and {self.reserve_s:g} s are for tests and export (time_budget.reserve_s). Give more "
+                f"than {enough:g} minutes; frames, map and views are kept, so the next run starts sooner."
             )
         groups = trainer.optimizers[0].param_groups  # of a resumed run they are where the last cycle ended
         self._highest = [group.get("initial_lr", group["lr"]) for group in groups]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
+from mambaloc import __version__
 from mambaloc.errors import suggestion
 
 _MODULES = {
@@ -31,7 +32,12 @@ _OF_TRAINING = {
     "torchmetrics",
 }  # fmt: skip
 """Modules of the packages of the extra ``train``."""
-_USAGE = "usage: mambaloc COMMAND [...]\n\n{}\n\nmambaloc COMMAND --help lists a command's options."
+_USAGE = """usage: mambaloc COMMAND [...]
+
+{}
+
+mambaloc COMMAND --help lists a command's options.
+mambaloc --version prints the version."""
 
 
 def main() -> None:
@@ -39,6 +45,9 @@ def main() -> None:
     name, words = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
     if name in ("-h", "--help"):
         print(_USAGE.format("\n".join(f"  {each:<10} {does}" for each, (_, does) in _MODULES.items())))
+        return
+    if name == "--version":
+        print(f"mambaloc {__version__}")
         return
     if name not in _MODULES:
         print(f"error: mambaloc {name}: no such command. {suggestion(name, _MODULES)}", file=sys.stderr)

@@ -20,6 +20,9 @@ from mambaloc.evaluation import (
 )
 from mambaloc.models import Checkpoint
 
+_FILES = ("metrics.json", "predictions.csv", "predictions.tum", "ground_truth.tum", "trajectory.png")
+_FILES_WITH_MAP = ("predictions_both.csv", "predictions_both.tum")
+
 
 @exit_on_input_error
 def main(argv: list[str] | None = None) -> None:
@@ -51,12 +54,11 @@ def main(argv: list[str] | None = None) -> None:
             if given := args[option]:
                 raise InputError(f"--{option} {given}: is of one scene, and this network knows several. Leave it out.")
         print_scenes(evaluate_scenes(checkpoint, out, data, args.accelerator, args.retrieval))
-        print(f"{out}: a folder per scene, each with metrics.json, predictions.csv, predictions.tum, trajectory.png")
+        print(f"{out}: a folder per scene, each with {', '.join(_FILES)}")
         return
     beside = measure_map(args.map, data) if args.map else measure_map_of_run(run, data)
     measured = evaluate_checkpoint(checkpoint, out, data, args.accelerator, args.retrieval, beside, args.rerun)
     print_table([measured])
-    both = ", predictions_both.csv, predictions_both.tum" if beside else ""
-    print(f"{out}: metrics.json, predictions.csv, predictions.tum{both}, trajectory.png")
+    print(f"{out}: {', '.join([*_FILES, *(_FILES_WITH_MAP if beside else ())])}")
     if args.rerun is not None:
         print(f"{args.rerun}: open it with rerun {args.rerun}")

@@ -76,7 +76,7 @@ def _change(args: argparse.Namespace) -> None:
         settings = {"key_frames": args.frames or MapSettings.key_frames, "most_bytes": MapSettings.most_bytes}
     cpu = time.process_time()
     if args.add:
-        growth = add_frames(before, frames, args.name or args.add.stem, *settings.values())
+        growth = add_frames(before, frames, args.name or args.add.absolute().stem, *settings.values())
         after = growth.sparse_map
         print(growth.describe(len(before)))
     elif args.remove:

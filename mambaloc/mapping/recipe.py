@@ -72,7 +72,11 @@ def read_recipe(path: Path) -> MapRecipe:
 
 def recipe_of(source: Path) -> MapRecipe:
     """The recipe in a file, or the default one of an imported scene's folder; errors are :func:`read_recipe`'s."""
-    return MapRecipe(str(source)) if source.is_dir() else read_recipe(source)
+    if not source.is_dir():
+        return read_recipe(source)
+    folder = source if source.name not in ("", "..") else source.resolve()
+    # A recipe's plain name is one of the dataset's scenes; this is a folder.
+    return MapRecipe(f"./{folder}" if str(folder) == folder.name else str(folder))
 
 
 def _is_int(value: object, minimum: int) -> bool:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -42,6 +43,26 @@ def test_the_list_of_commands_needs_no_torch():
     done = subprocess.run([sys.executable, "-c", listed], capture_output=True, text=True, check=True, cwd=ROOT)
     assert "  train      train a recipe\n" in done.stdout
     assert done.stdout.endswith("False\n")
+
+
+def test_the_module_runs_as_the_command_does():
+    """Guess: argparse would name the program ``__main__.py``; every subcommand names itself by ``sys.argv``."""
+    for words in (["--help"], ["verify", "--help"]):
+        script = f"import sys; sys.argv = ['mambaloc', *{words}]; from mambaloc.commands import main; main()"
+        ended = [
+            subprocess.run([sys.executable, *how], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+            for how in (["-m", "mambaloc", *words], ["-c", script])
+        ]
+        assert ended[0] == ended[1]
+        assert ended[0].startswith("usage: mambaloc ")
+
+
+def test_the_version_is_that_of_the_distribution_and_needs_no_torch():
+    blocked = "import sys; sys.modules['torch'] = None; sys.argv = ['mambaloc', '--version']\n"
+    program = blocked + "from mambaloc.commands import main; main()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert (done.stdout, done.stderr) == (f"mambaloc {stated}\n", "")
 
 
 @pytest.mark.parametrize(

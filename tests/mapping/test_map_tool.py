@@ -9,11 +9,12 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from mambaloc.commands.map import main
+from mambaloc.data.datasets.registry import locate
 from mambaloc.errors import InputError
 from mambaloc.mapping import evaluating
 from mambaloc.mapping.building import MapSettings
 from mambaloc.mapping.evaluating import MapErrors, build_and_measure, covers
-from mambaloc.mapping.recipe import MapRecipe, read_recipe
+from mambaloc.mapping.recipe import MapRecipe, read_recipe, recipe_of
 from mambaloc.runtime.maps import SparseMap
 
 ROOT = Path(__file__).parents[2]
@@ -43,6 +44,30 @@ def test_the_recipe_of_the_blocks_is_read():
     recipe = read_recipe(BLOCKS)
     assert recipe.label == "redkitchen seq-01 blocks (800/200)"
     assert isinstance(recipe, MapRecipe)
+
+
+@pytest.mark.parametrize(
+    ("here", "source"),
+    [(".", "room"), (".", "./room"), ("..", "scenes/room"), ("room", "."), ("room/images", ".."), (".", "{}/room")],
+)
+def test_an_imported_scenes_folder_may_be_named_in_any_way(here, source, tmp_path, monkeypatch):
+    """Guess: ``Path("./room")`` is ``Path("room")``, so that both were taken for a scene of 7-Scenes."""
+    scenes = tmp_path / "scenes"
+    (scenes / "room/images").mkdir(parents=True)
+    (scenes / "room/scene.json").write_text('{"mambaloc_scene": 1}')
+    monkeypatch.chdir(scenes / here)
+    recipe = recipe_of(Path(source.format(scenes)))
+    dataset, root, scene = locate(recipe.dataset, recipe.root, recipe.scene)
+    assert (dataset, scene, recipe.name) == ("capture", "room", "room")
+    assert Path(root).resolve() == scenes
+
+
+def test_a_folder_that_is_not_a_scene_is_named_with_how_to_import_it(tmp_path, monkeypatch, capsys):
+    (tmp_path / "photos").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        main(["photos"])
+    assert "photos: is not an imported scene; make one with: mambaloc import photos" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

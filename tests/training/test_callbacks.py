@@ -138,3 +138,13 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last(error, tmp_path, mo
         AtomicCheckpointIO().save_checkpoint({"epoch": 2}, path)
     assert torch.load(path, weights_only=True) == {"epoch": 1}
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_only_an_epoch_with_validation_can_be_the_best(tiny_recipe, tmp_path, recwarn):
+    """Guess: in an epoch without validation Lightning still has the value of the last one; it kept epoch 2 as well."""
+    every = ["--best_checkpoint.save_top_k", "-1", "--best_checkpoint.filename", "{epoch}"]
+    options = [*every, "--trainer.check_val_every_n_epoch", "2", "--trainer.max_epochs", "3"]
+    main([str(tiny_recipe), *options, "--trainer.default_root_dir", str(tmp_path / "run")])
+    kept = {path.name for path in (tmp_path / "run/checkpoints").iterdir()}
+    assert kept == {"epoch=1.ckpt", "last.ckpt"}
+    assert not [str(each.message) for each in recwarn if "could not find the monitored key" in str(each.message)]

@@ -155,6 +155,9 @@ def test_evaluate_tool_prints_and_writes(trained, tmp_path):
     assert done.stderr == ""
     assert "last" in done.stdout
     assert "median training pose" in done.stdout
+    folder, _, files = done.stdout.splitlines()[-1].partition(": ")
+    assert folder == str(tmp_path / "out")
+    assert set(files.split(", ")) == {path.name for path in (tmp_path / "out").iterdir()}
     metrics = [
         json.loads((f / "metrics.json").read_text())["metrics"] for f in (tmp_path / "out", trained / "evaluation/last")
     ]

@@ -1,5 +1,6 @@
 """Training for so many minutes, and the bundle that it ends with."""
 
+import re
 import time
 from types import SimpleNamespace
 
@@ -57,26 +58,34 @@ def test_the_time_before_the_first_step_and_the_reserve_are_part_of_the_budget(c
     assert logged == {"time/left_s": 0.0}
 
 
-def test_a_budget_ends_a_run_that_has_no_other_end(tiny_recipe, tmp_path):
+def test_a_budget_ends_a_run_that_has_no_other_end(tiny_recipe, tmp_path, capsys):
+    """Its progress bar names the epoch alone. Guess: Lightning's draws ``Epoch 0/-2``."""
     options = ["--trainer.max_epochs", "-1", "--time_budget.minutes", "0.25", "--time_budget.reserve_s", "1"]
     main([str(tiny_recipe), *options, "--trainer.default_root_dir", str(tmp_path / "run")])
     assert read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")["global_step"] > 5
     assert (tmp_path / "run/evaluation/last/metrics.json").is_file()
+    drawn = re.findall(r"Epoch (\S+)", capsys.readouterr().out)
+    assert drawn
+    assert all(epoch.isdecimal() for epoch in drawn)
 
 
 def test_a_budget_that_is_used_up_before_the_first_step(clock):
-    budget, clock.s = TimeBudget(minutes=1), 61.0
-    with pytest.raises(InputError, match=r"time_budget\.minutes 1: 61 s went by before the first step\. Give more"):
+    """35 s of start and 30 s of reserve are 1.083 minutes."""
+    budget, clock.s = TimeBudget(minutes=1), 35.0
+    parts = r"35 s went by before the first step, and 30 s are for tests and export \(time_budget\.reserve_s\)"
+    line = rf"^time_budget\.minutes 1: leaves no time to train\. {parts}\. Give more than 1\.1 minutes; "
+    with pytest.raises(InputError, match=line):
         budget.on_train_start(SimpleNamespace(fast_dev_run=0), SimpleNamespace())
-    with pytest.raises(InputError, match=r"time_budget\.minutes 0.2: must be more than the 30 s of"):
-        TimeBudget(minutes=0.2)
+    for minutes in (0.2, 0.5, float("inf"), float("nan")):
+        with pytest.raises(InputError, match=r"finite number above 0\.5, since the last 30 s are for tests and export"):
+            TimeBudget(minutes=minutes)
 
 
 def test_a_budget_counts_from_the_start_of_the_command(tiny_recipe, tmp_path, capsys):
     options = ["--time_budget.minutes", "1", "--trainer.default_root_dir", str(tmp_path / "run")]
     with pytest.raises(SystemExit, match="2"):
         main([str(tiny_recipe), *options], began_s=time.monotonic() - 61)
-    assert "s went by before the first step. Give more" in capsys.readouterr().err
+    assert "s went by before the first step, and 30 s are for tests and export" in capsys.readouterr().err
 
 
 def test_the_progress_bar_shows_the_seconds_left():

@@ -17,7 +17,7 @@ from pathlib import Path
 from maps_report import by_disturbance, draw, overview, read_results
 
 from mambaloc.console import OptionParser, configure_logging, exit_on_input_error, whole_number
-from mambaloc.mapping.recipe import MapRecipe, read_recipe
+from mambaloc.mapping.recipe import recipe_of
 
 
 @exit_on_input_error
@@ -58,7 +58,7 @@ def main() -> None:
 
         print(calibrate(args.folders))
         return
-    recipe = MapRecipe(str(args.source)) if args.source.is_dir() else read_recipe(args.source)
+    recipe = recipe_of(args.source)
     given = {"key_frames": args.frames, "width": args.width}
     settings = replace(recipe.settings, **{key: value for key, value in given.items() if value is not None})
     recipe = replace(recipe, settings=settings, ransac_seeds=tuple(args.seeds or recipe.ransac_seeds))
