@@ -7,7 +7,6 @@ from typing import Any, Self
 
 import timm
 import torch
-from huggingface_hub import get_hf_file_metadata, hf_hub_url, try_to_load_from_cache
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from timm.models import group_parameters
@@ -204,8 +203,6 @@ def _timm_model(name: str, weights: str | None, timm_args: dict[str, Any] | None
     """Build a timm model, with errors a user can act on."""
     _check_known(name)
     try:
-        if weights == "timm" and not (timm_args or {}).keys() & {"pretrained_cfg", "pretrained_cfg_overlay"}:
-            _check_reachable(name)
         return timm.create_model(name, pretrained=weights == "timm", **cut, **(timm_args or {}))
     except TypeError as error:
         raise InputError(f"backbone_args {timm_args}: {name} does not take them ({error})") from None
@@ -216,27 +213,6 @@ def _timm_model(name: str, weights: str | None, timm_args: dict[str, Any] | None
             f"model.backbone_weights: timm's weights of {name} could not be fetched ({type(error).__name__}). "
             "Connect to the Internet, name a local .safetensors file, or null to start from scratch."
         ) from error
-
-
-def _check_reachable(name: str) -> None:
-    """Ask once for timm's weights unless they are kept: its download of two files asks six times each, for 47 s.
-
-    A connection that is only slow is left to the download, which waits longer.
-
-    Raises:
-        ConnectionError: where no connection can be made.
-    """
-    config = timm.get_pretrained_cfg(name)
-    if config is None or not config.hf_hub_id:
-        return
-    files = [config.hf_hub_filename] if config.hf_hub_filename else ["model.safetensors", "pytorch_model.bin"]
-    if any(isinstance(try_to_load_from_cache(config.hf_hub_id, file), str) for file in files):
-        return
-    try:
-        get_hf_file_metadata(hf_hub_url(config.hf_hub_id, files[0]))
-    except Exception as error:  # of the hub's client, or of its transport, which depends on its version
-        if "Connect" in type(error).__name__:  # neither an answer, such as 404, nor one that is late
-            raise ConnectionError(str(error)) from error
 
 
 def _check_known(name: str) -> None:

@@ -1,7 +1,4 @@
-import os
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -173,46 +170,6 @@ def test_weights_that_lack_tensors_are_refused_and_one_named(tmp_path):
         "1 tensors of mobilenetv3_small_050 are missing, such as conv_stem.weight",
         weights=str(tmp_path / "part.safetensors"),
     )
-
-
-def offline(home):
-    """Build ``SMALL`` of timm's weights where nothing listens at the hub's port; what became of it, and the seconds."""
-    program = f"""
-import time
-from mambaloc.nn import PooledBackbone
-began_s = time.monotonic()
-try:
-    made = PooledBackbone("{SMALL}", weights="timm").body.conv_stem.weight.mean().item()
-except Exception as error:
-    made = f"{{type(error).__name__}} {{error}}"
-print(time.monotonic() - began_s, made)
-"""
-    nowhere = {"HF_ENDPOINT": "http://127.0.0.1:9", "HF_HOME": str(home), "NO_PROXY": "127.0.0.1"}
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, **nowhere})
-    seconds, made = done.stdout.split(maxsplit=1)
-    return made, done.stderr, float(seconds)
-
-
-def test_timm_weights_without_a_network_are_refused_at_once(tmp_path):
-    """Guess: the hub's client asks once. It asks six times for each of two files, for 47 s."""
-    made, warned, seconds = offline(tmp_path)
-    assert made.startswith("InputError model.backbone_weights")
-    assert "could not be fetched (ConnectionError). Connect to the Internet" in made
-    assert warned == ""
-    assert seconds < 10
-
-
-def test_timm_weights_that_are_kept_need_no_network(tmp_path):
-    """In the hub's own folders, as its client leaves them."""
-    folder = tmp_path / "hub" / f"models--{timm.get_pretrained_cfg(SMALL).hf_hub_id.replace('/', '--')}"
-    (folder / "refs").mkdir(parents=True)
-    (folder / "refs/main").write_text("0" * 40)
-    (folder / "snapshots" / ("0" * 40)).mkdir(parents=True)
-    state = {**timm.create_model(SMALL).state_dict(), "conv_stem.weight": torch.full((16, 3, 3, 3), 0.25)}
-    save_file(state, folder / "snapshots" / ("0" * 40) / "model.safetensors")
-    made, warned, _ = offline(tmp_path)
-    assert float(made) == 0.25, warned
 
 
 def test_timm_weights_that_cannot_be_fetched_are_one_line(offline_timm):
