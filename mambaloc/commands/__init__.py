@@ -44,7 +44,7 @@ def main() -> None:
     """Run the subcommand that the command line names. Nothing heavy is imported before it is known."""
     name, words = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
     if name in ("-h", "--help"):
-        print(_USAGE.format("\n".join(f"  {each:<10} {does}" for each, (_, does) in _MODULES.items())))
+        print(_USAGE.format("\n".join(f"  {each:<12} {does}" for each, (_, does) in _MODULES.items())))
         return
     if name == "--version":
         print(f"mambaloc {__version__}")
@@ -52,14 +52,22 @@ def main() -> None:
     if name not in _MODULES:
         print(f"error: mambaloc {name}: no such command. {suggestion(name, _MODULES)}", file=sys.stderr)
         raise SystemExit(2)
-    sys.argv = [f"mambaloc {name}", *words]
-    run(name)
+    if name == "train":  # Lightning starts the process again for each further device, by the words in sys.argv
+        run(name, words)
+    else:
+        sys.argv = [f"mambaloc {name}", *words]
+        run(name)
 
 
-def run(name: str) -> None:
-    """Run a subcommand on the words of ``sys.argv``; print one line if it needs PyTorch, which is missing."""
+def run(name: str, *words: list[str]) -> None:
+    """Run a subcommand; print one line if it needs PyTorch, which is missing.
+
+    Args:
+        name: of the subcommand.
+        words: what follows it on the command line, for ``train``; those of ``sys.argv`` unless given.
+    """
     try:
-        import_module(f"{__name__}.{_MODULES[name][0]}").main()
+        import_module(f"{__name__}.{_MODULES[name][0]}").main(*words)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in _OF_TRAINING:
             raise

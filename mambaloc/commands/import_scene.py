@@ -37,7 +37,8 @@ def main() -> None:
     parser.add_argument("--adjust-poses", action="store_true", help="also write poses that fit the images better")
     args = parser.parse_args()
     topics = BagTopics(args.topic, args.pose_topic, args.pose_frame)
-    command = shlex.join(["python", *sys.argv])
+    is_script = sys.argv[0].endswith(".py")
+    command = shlex.join([*(["python", sys.argv[0]] if is_script else ["mambaloc", "import"]), *sys.argv[1:]])
     imported = import_scene(
         args.source,
         args.out,

@@ -11,4 +11,4 @@ from mambaloc import cli  # noqa: E402
 
 def main(argv: list[str] | None = None) -> cli.RecipeCLI:
     """Train; a run gets a folder of its own."""
-    return cli.main(argv, began_s if argv is None else None)
+    return cli.main(argv, began_s)

@@ -41,7 +41,7 @@ def test_the_list_of_commands_needs_no_torch():
         "import sys; from mambaloc import commands; sys.argv = ['']; commands.main(); print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", listed], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert "  train      train a recipe\n" in done.stdout
+    assert "  train        train a recipe\n  evaluate     measure" in done.stdout
     assert done.stdout.endswith("False\n")
 
 

@@ -52,8 +52,9 @@ def test_two_processes_of_lightnings(recipe, tmp_path):
 
     Half a minute: two processes import torch, train and export, as two machines would; nothing else guards that.
     """
-    run = tmp_path / "runs/run"
-    words = [*TRAIN, recipe, "--trainer.devices", "2", "--trainer.default_root_dir", run]
+    run, command = tmp_path / "runs/run", tmp_path / "mambaloc"
+    command.write_text("from mambaloc.commands import main\nif __name__ == '__main__':\n    main()\n")  # as pip does
+    words = [sys.executable, command, "train", recipe, "--trainer.devices", "2", "--trainer.default_root_dir", run]
     words += ["--best_checkpoint.save_top_k", "1", "--onnx_export.enabled", "true"]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 0, done.stderr
