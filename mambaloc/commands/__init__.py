@@ -59,7 +59,7 @@ def main() -> None:
         run(name)
 
 
-def run(name: str, *words: list[str]) -> None:
+def run(name: str, words: list[str] | None = None) -> None:
     """Run a subcommand; print one line if it needs PyTorch, which is missing.
 
     Args:
@@ -67,7 +67,11 @@ def run(name: str, *words: list[str]) -> None:
         words: what follows it on the command line, for ``train``; those of ``sys.argv`` unless given.
     """
     try:
-        import_module(f"{__name__}.{_MODULES[name][0]}").main(*words)
+        subcommand = import_module(f"{__name__}.{_MODULES[name][0]}")
+        if words is None:
+            subcommand.main()
+        else:
+            subcommand.main(words)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in _OF_TRAINING:
             raise
