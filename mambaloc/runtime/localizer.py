@@ -32,7 +32,7 @@ class Localizer:
 
     Args:
         model: an ``.onnx`` or ``.ort`` file that ``mambaloc export`` wrote; a bundle's folder; or a ``.safetensors``
-            file that ``mambaloc map`` wrote, to localize in the map alone.
+            file that ``mambaloc map`` wrote, or its folder, to localize in the map alone.
         threads: that the network may use for one image; ONNX Runtime's choice unless given.
         sparse_map: the map to use beside a network, or its file. True takes the bundle's own, if it has one; False
             leaves it out.
@@ -45,10 +45,10 @@ class Localizer:
     def __init__(
         self, model: str | Path, threads: int | None = None, sparse_map: SparseMap | str | Path | bool = True
     ) -> None:
-        path = Path(model)
-        is_map = path.suffix == Path(MAP_FILE).suffix
-        self._network = None if is_map else Network(_model_file(path), threads)
-        found = SparseMap.load(path) if is_map else _map_beside(path, sparse_map)
+        path, file = Path(model), _model_file(Path(model))
+        is_map = file.suffix == Path(MAP_FILE).suffix
+        self._network = None if is_map else Network(file, threads)
+        found = SparseMap.load(file) if is_map else _map_beside(path, sparse_map)
         self._map = None if found is None else MapLocalizer(found)
         self._path = path
 
@@ -245,7 +245,7 @@ def _warn_of_focal_length(found: MapLocalization) -> None:
 def _model_file(path: Path) -> Path:
     if not path.is_dir():
         return path
-    found = [path / name for name in MODEL_FILES.values() if (path / name).is_file()]
+    found = [path / name for name in (*MODEL_FILES.values(), MAP_FILE) if (path / name).is_file()]
     if not found:
         raise InputError(f"{path}: contains no {' or '.join(MODEL_FILES.values())}; give a bundle of mambaloc export")
     return found[0]

@@ -72,6 +72,13 @@ def test_the_map_answers_where_it_is_sure(both, frame, map_of_den):
     assert 0 < found.rotation_radius_deg < 5
 
 
+def test_a_folder_with_a_map_alone_is_localized_in(map_of_den, frame, tmp_path):
+    (tmp_path / "map.safetensors").write_bytes(map_of_den.read_bytes())
+    localizer = Localizer(tmp_path)
+    assert localizer.contract is None
+    check_is_of_the_map(localizer.localize(frame), frame)
+
+
 def test_the_network_answers_where_the_map_does_not(both, network):
     found, alone = both.localize(GREY), Localizer(network, 1).localize(GREY)
     assert (found.source, found.inliers, found.covariance) == ("network", 0, None)

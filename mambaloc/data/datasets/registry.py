@@ -76,7 +76,7 @@ def how_to_get(dataset: str, scene: str, root: Path) -> str:
     """
     path = Path(scene) if Path(scene).name != scene else root / scene if dataset == CAPTURE else None
     if path is None and capture.is_captured(Path(scene)):
-        return f"{scene} is not in {root}; if you mean the imported scene here, name its path: --data.scene ./{scene}"
+        return f"{scene} is not in {root}. If you mean the imported scene here, name its path, ./{scene}."
     if path is None:
         return find_source(dataset).how_to_get(scene, root)
     source, out = (path, Path("scenes", path.name)) if path.is_dir() else ("CAPTURE", path)

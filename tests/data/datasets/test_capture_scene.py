@@ -214,7 +214,7 @@ def test_what_is_no_scene_says_how_to_make_one(scene, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="scenes/dan: is not an imported scene; make one with"):
         scene_folder("capture", None, "dan")
     monkeypatch.chdir(tmp_path / "scenes")
-    with pytest.raises(InputError, match=re.escape("name its path: --data.scene ./den")):
+    with pytest.raises(InputError, match=re.escape("If you mean the imported scene here, name its path, ./den.")):
         scene_folder("7scenes", None, "den")
     assert is_captured(scene)
     assert not is_captured(tmp_path)
